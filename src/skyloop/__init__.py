@@ -8,9 +8,9 @@
         drone.takeoff()
         drone.velocity(forward=0.3)
 
-The names come from the stub next to this file, ``__init__.pyi``, which type checkers read, too. Each name is imported
-on first use, so ``import skyloop`` loads nothing heavy. The packages hold more: ``skyloop.messages``,
-``skyloop.errors``, ``skyloop.control``, ``skyloop.vision``, ….
+The names come from the stub next to this file, ``__init__.pyi``, which type checkers also read. Each name is imported
+on first use: ``import skyloop`` loads nothing heavy. More is in the packages: ``skyloop.messages``, ``skyloop.errors``,
+``skyloop.control``, ``skyloop.vision``, ….
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ from pathlib import Path
 from typing import Any
 
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-# Turn off telemetry in dependencies before any of them is imported (docs/security.md lists them). To allow it, set the
-# variable.
+# Turn off telemetry in dependencies before importing them (see docs/security.md). To allow telemetry, set the variable.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 
-#: The module that each name is imported from.
+#: The module from which each name is imported.
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
-#: Packages to search for names that are not available here, the lightest first.
+#: Packages to search for names that are not available here, beginning with the fastest to import.
 _ELSEWHERE = ("errors", "messages", "client", "control", "recording", "motion_capture")
 
 __all__ = sorted(["__version__", *_HOMES])  # noqa: PLE0605  (made of the stub)
@@ -53,7 +52,7 @@ def __dir__() -> list[str]:
 
 
 def _hint(name: str) -> str:
-    """Return where to find a class of this name, for an error message; empty if there is none."""
+    """Return where to find the class ``name``, for an error message; empty if there is no such class."""
     if not name[:1].isupper():
         return ""
     for package in _ELSEWHERE:

@@ -1,7 +1,7 @@
-"""Decide what may be shown of an address (never users, passwords or keys), and whether it is local. Pure.
+"""Decide which parts of an address may be shown (never users, passwords or keys), and whether it is local. Pure.
 
-People also write passwords unquoted, including characters that separate the parts of an address. If it is ambiguous
-where a password ends, everything after it is hidden, too.
+People also write passwords without quoting them, including characters that separate the parts of an address. If it is
+unclear where a password ends, everything after it is hidden, too.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ HIDDEN: Final = "***"
 _SECRET: Final = "password|passwd|passphrase|pass|pwd|pw|token|secret|key|apikey|auth|credential|credentials"
 _SECRET_NAME: Final = re.compile(rf"(?i)(?:.*[_.-])?(?:{_SECRET})\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
-#: A secret within a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``, whose end is ambiguous.
+#: A secret within a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``; its end is ambiguous.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
 _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
-#: Prefixes of places that are devices and so never contain a user name, even if their path contains an ``@``.
+#: Prefixes of places that are devices. They never contain a user name, even if their path contains an ``@``.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
-_KEEP: Final = "/:@*,;=()[]~!$'+"  # usual punctuation in addresses
+_KEEP: Final = "/:@*,;=()[]~!$'+"  # punctuation that is common in addresses
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether the address can be reached only from this machine."""
+    """Return whether an address can be reached only from this machine."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -33,10 +33,11 @@ def is_loopback(host: str) -> bool:
 
 
 def without_secrets(text: str, option: str = "", *, broken: bool = False, place_of: str = "") -> str:
-    """Return a part of an address without anything that may be secret: user, password, query and keys.
+    """Return a part of an address without anything that might be secret: user, password, query and keys.
 
-    ``text`` (percent-decoded) is the address of a stream, the value of ``option``, or the place in a vehicle's address,
-    whose scheme is ``place_of``. ``broken``: whether splitting the address may have cut a password in it.
+    ``text`` (percent-decoded) is either the address of a stream, the value of ``option``, or the place in a vehicle's
+    address with the scheme ``place_of``. ``broken``: whether the address may have been split in the middle of a
+    password.
     """
     if _SECRET_NAME.match(option):
         return HIDDEN
@@ -56,17 +57,17 @@ def _hide(path: str) -> str:
 
 
 def shown_name(option: str) -> str:
-    """Return an option's name if it can be shown; an invalid name may be the end of a password, so it is hidden."""
+    """Return an option's name if it can be shown; hide an invalid name, which may be the end of a password."""
     return option if _NAME.match(option) else HIDDEN
 
 
 def is_broken(options: Iterable[str]) -> bool:
-    """Return whether the names of the options show that an address was split within its password."""
+    """Return whether the names of the options indicate that an address was split within its password."""
     return any("@" in option for option in options)
 
 
 def shown_address(text: str) -> str:
-    """Return what the user entered, ``scheme://place?option=value`` or anything else, without possible secrets."""
+    """Return what the user entered, ``scheme://place?option=value`` or any other text, without possible secrets."""
     scheme, separator, rest = text.partition("://")
     place, mark, query = rest.partition("?")
     if not separator:

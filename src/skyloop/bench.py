@@ -1,6 +1,6 @@
-"""Measure the user's machine: delays, compared to a bare transfer of the same bytes, and the simulator's speed.
+"""Measure delays on the user's machine, compared to a bare transfer of the same bytes, and the simulator's speed.
 
-``skyloop bench`` prints the results. The developers' measurements are in the repository's ``benchmarks/``.
+``skyloop bench`` prints the results. The developers' own measurements are in ``benchmarks/`` in the repository.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 Setpoint = tuple[float, float, float]  #: forward and left [m/s], yaw rate [rad/s]
-#: Called for each received sample with its channel and sending time [ns, monotonic].
+#: Called for each received sample with its channel and the time at which it was sent [ns, monotonic].
 Received = Callable[[str, int], None]
-#: Called with the fraction done so far (0 to 1) and the next measurement.
+#: Called with the fraction done so far (0 to 1) and the name of the next measurement.
 Progress = Callable[[float, str], None]
 
 COMMAND: Final = "command"
 FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
-#: The channels, with their periods [s] in the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
+#: The channels and their periods [s], from the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
 LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
 
@@ -78,10 +78,10 @@ _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
 
 class Machine(msgspec.Struct, frozen=True):
-    """The machine on which figures were measured, without anything that identifies it or its user."""
+    """The machine on which the figures were measured, without anything that identifies it or its user."""
 
     cpu: str
-    cores: int  #: cores available to this process
+    cores: int  #: number of cores available to this process
     system: str
     kernel: str
     python: str
@@ -107,19 +107,19 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 def cpu_model(cpuinfo: str) -> str:
-    """Return the model name in ``/proc/cpuinfo``; empty if there is none."""
+    """Return the model name in ``/proc/cpuinfo``; empty if it contains none."""
     found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo, re.MULTILINE)
     return " ".join(found[1].split()) if found else ""
 
 
 def os_name(os_release: str) -> str:
-    """Return the display name in ``/etc/os-release``; empty if there is none."""
+    """Return the display name in ``/etc/os-release``; empty if it contains none."""
     found = re.search(r'^PRETTY_NAME="?([^"\n]+)"?$', os_release, re.MULTILINE)
     return found[1] if found else ""
 
 
 def numbers_of(release: str) -> str:
-    """Return a kernel's release without the builder's suffix, which may name a machine."""
+    """Return a kernel's release without the builder's suffix, which may contain the name of a machine."""
     found = re.match(r"\d+(\.\d+)*", release)
     return found[0] if found else ""
 
@@ -159,21 +159,21 @@ def spread(times_ns: Sequence[float]) -> Spread:
 CAMERA: Final = "bench"
 USUAL_CAMERA: Final = CameraInfo(CAMERA, 320, 240, 15.0)
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
-_UNIT_M_S: Final = 2.0**-46  # climb rate per nanosecond; 2**40 ns stay below 2 cm/s
+_UNIT_M_S: Final = 2.0**-46  # climb rate per nanosecond; 2**40 ns correspond to less than 2 cm/s
 
 
 def stamped(sent_ns: int) -> float:
-    """Encode a time as a climb rate below 2 cm/s, which a command represents exactly and which is within all limits."""
+    """Encode a time as a climb rate below 2 cm/s, which a command represents exactly and all limits allow."""
     return (sent_ns % _WRAPS_NS) * _UNIT_M_S
 
 
 def stamp_of(up: float, now_ns: int) -> int:
-    """Decode a time [ns] that :func:`stamped` encoded as a climb rate [m/s] within the last 18 minutes."""
+    """Decode a time [ns] within the last 18 minutes that :func:`stamped` encoded as a climb rate [m/s]."""
     return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
-    """A vehicle that hovers forever and produces feedback and frames on request, to measure only Skyloop.
+    """A vehicle that always hovers and produces feedback and frames on request, to measure Skyloop alone.
 
     ``received`` is called with each new set-point, on the thread that applies it.
     """
@@ -194,7 +194,7 @@ class BenchVehicle(Driver):
         self.publish_feedback(time.monotonic_ns())
 
     def _close(self) -> None:
-        """Do nothing, because no resources are held."""
+        """Do nothing: there are no resources to release."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         now_ns = time.monotonic_ns()
@@ -210,18 +210,18 @@ class BenchVehicle(Driver):
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
 
     def publish_feedback(self, captured_ns: int) -> None:
-        """Publish feedback with as many values as a real vehicle's."""
+        """Publish feedback that contains as many values as a real vehicle sends."""
         if (sink := self._sink) is not None:
             sink.feedback(typical_feedback(captured_ns, FlightState.HOVERING))
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the measured proxy."""
+    """Return the name of the proxy to measure."""
     return Path(folder).name.lower()
 
 
 class Vehicle:
-    """The proxy's end, named after this run's folder."""
+    """The proxy's end; its name comes from this run's folder."""
 
     camera = USUAL_CAMERA
 
@@ -258,7 +258,7 @@ class Listening:
 
     def feedback(self, feedback: Feedback) -> None:
         """Report new feedback."""
-        if feedback.captured_ns > self._known_ns:  # the proxy repeats the last state when the authority changes hands
+        if feedback.captured_ns > self._known_ns:  # when the authority changes hands, the proxy repeats the last state
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
 
@@ -272,7 +272,7 @@ class Listening:
 
 
 class Application:
-    """The end that has the user's drone; start :class:`Vehicle` first."""
+    """The application's end, which has the user's drone; start :class:`Vehicle` first."""
 
     looks = True  #: whether to receive the video
     video = VideoOptions()  #: format of the video
@@ -307,9 +307,9 @@ _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 class BareVehicle:
     """A connection without Skyloop: the minimum that any Python library must do to transfer the same bytes.
 
-    One ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet has 100 bytes, which include the sending
-    time. A frame is copied into memory that both processes map, and a packet of 24 bytes announces it; the receiver
-    creates an array over the memory. Arguments and methods are those of :class:`Vehicle`.
+    Uses one ``SOCK_SEQPACKET`` socket, with a waiting thread at each end. A packet has 100 bytes, including the time at
+    which it is sent. A frame is copied into memory that both processes map. A packet of 24 bytes announces the frame,
+    and the receiver creates an array over the memory. The arguments and methods are those of :class:`Vehicle`.
     """
 
     def __init__(self, folder: str, received: Received) -> None:
@@ -317,7 +317,7 @@ class BareVehicle:
         self._descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
-        self._memory[:] = 1  # map the pages in advance: Skyloop's slots stay mapped after their first use
+        self._memory[:] = 1  # map the pages in advance: Skyloop's slots also stay mapped after their first use
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
@@ -345,7 +345,7 @@ class BareVehicle:
         try:
             self._socket, _ = self._listener.accept()
         except OSError:
-            return  # closed before there was a connection
+            return  # closed before a connection was made
         with self._socket as sock:
             socket.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
@@ -353,7 +353,7 @@ class BareVehicle:
 
 
 class BareApplication:
-    """The other end of :class:`BareVehicle`, with the arguments and methods of :class:`Application`."""
+    """The other end of :class:`BareVehicle`; arguments and methods are those of :class:`Application`."""
 
     def __init__(self, folder: str, received: Received) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -392,20 +392,20 @@ _ENDS: Final[dict[str, tuple[Callable[..., Any], Callable[..., Any]]]] = {
     BARE: (BareVehicle, BareApplication),
     SKYLOOP: (Vehicle, Application),
 }
-_TURN_S: Final = 5.0  # duration of one measurement of one kind of connection
-_WARM_UP_S: Final = 0.4  # uncounted start of a measurement, which sets up threads, slots and the connection
+_TURN_S: Final = 5.0  # duration of each measurement of each kind of connection
+_WARM_UP_S: Final = 0.4  # start of a measurement that is not counted: it sets up threads, slots and the connection
 _SETTLE_S: Final = 0.3  # time for the last samples of a measurement to arrive
-_AHEAD_NS: Final = 50_000_000  # how far in the future the start time is set, so that both processes can start together
-_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process's answer after the measurement
-_GOLDEN: Final = 0.618034  # its multiples modulo 1 are spread evenly for any count
+_AHEAD_NS: Final = 50_000_000  # how far ahead the start is scheduled, so that both processes start together
+_ANSWERS_WITHIN_S: Final = 30.0  # time limit for a process to answer after the measurement
+_GOLDEN: Final = 0.618034  # its multiples modulo 1 are evenly spread, however many there are
 _BOOT: Final = "import sys; from skyloop.bench import _run_end; _run_end(int(sys.argv[1]), *sys.argv[2:])"
 
-#: Times at which each sample was sent and received [ns], by channel.
+#: Times at which each sample was sent and received [ns], grouped by channel.
 _Arrivals = dict[str, list[tuple[int, int]]]
 
 
 class _Turn(msgspec.Struct, frozen=True):
-    """A measurement with all three channels active at once; ``number`` varies the phases between them."""
+    """A measurement of all three channels at once; ``number`` varies the phases between the channels."""
 
     number: int
     seconds: float
@@ -415,7 +415,7 @@ class _Turn(msgspec.Struct, frozen=True):
         return max(1, int(self.seconds / PERIODS_S[channel]))
 
     def paced(self, channel: str, begin_ns: int) -> Iterator[int]:
-        """Yield each sample's number when due, starting with the warm-up; a late sample does not delay the others."""
+        """Yield the number of each sample when it is due, starting with the warm-up; late samples delay no others."""
         period_ns = PERIODS_S[channel] * 1e9
         phase = list(PERIODS_S).index(channel) * (1 + self.number) * _GOLDEN % 1.0
         for index in range(-int(_WARM_UP_S / PERIODS_S[channel]), self.count(channel)):
@@ -424,9 +424,9 @@ class _Turn(msgspec.Struct, frozen=True):
 
 
 class DelayRow(msgspec.Struct, frozen=True):
-    """The results of one channel with frames of one size."""
+    """Results of one channel for frames of one size."""
 
-    size: str  #: size of the frames, ``320×240``
+    size: str  #: size of the frames, such as ``320×240``
     channel: str
     skyloop: Spread
     bare: Spread
@@ -434,7 +434,7 @@ class DelayRow(msgspec.Struct, frozen=True):
 
 
 class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
-    """The results of a run. ``seconds``: duration of each measurement at each size."""
+    """Results of a run. ``seconds`` is the duration of each measurement for each size."""
 
     machine: Machine
     seconds: float
@@ -447,7 +447,7 @@ def measure_delays(
     """Measure Skyloop and a bare connection in turn, each between two processes.
 
     Each measurement takes ``seconds`` for each frame size (width and height, at most :data:`LARGEST`). Raises
-    :class:`LinkError` if the processes do not find each other, or nothing arrives.
+    :class:`LinkError` if the processes do not find each other, or if nothing arrives.
     """
     machine, rounds = Machine.here(), max(1, round(seconds / _TURN_S))
     turns = [_Turn(number, seconds / rounds, size) for number in range(rounds) for size in sizes]
@@ -493,7 +493,7 @@ class _Pair:
 
     def measure(self, turn: _Turn) -> dict[str, list[int]]:
         """Return the delays of the samples received in a measurement [ns], by channel."""
-        for pipe in self._pipes:  # the vehicle must start before the application
+        for pipe in self._pipes:  # the vehicle must start first
             pipe.send(turn)
             self._answer(pipe)
         begin_ns = time.monotonic_ns() + round(_WARM_UP_S * 1e9) + _AHEAD_NS
@@ -519,13 +519,13 @@ class _Pair:
 
     def __exit__(self, *_: object) -> None:
         for pipe in self._pipes:
-            pipe.close()  # makes the process exit
+            pipe.close()  # causes the process to exit
         for process in self._processes:
             process.close()
 
 
 def _run_end(number: int, kind: str, side: str, folder: str) -> None:
-    """Run one end of a measured connection until its pipe closes. The main function of a process."""
+    """Run one end of a measured connection until its pipe closes. This is the main function of a process."""
     make, work = _ENDS[kind][side == "application"], _WORK[side]
     with Connection(number) as pipe, suppress(KeyboardInterrupt, EOFError, BrokenPipeError):
         while True:
@@ -563,7 +563,7 @@ def _produce(end: Vehicle, turn: _Turn, begin_ns: int) -> None:
 
 
 def _steer(end: Application, turn: _Turn, begin_ns: int) -> None:
-    """Send a series of set-points that all differ."""
+    """Send a series of set-points, each different from the others."""
     for index in turn.paced(COMMAND, begin_ns):
         speed, angle = 0.5 + 0.4 * math.sin(0.05 * index), 0.03 * index
         end.command(time.monotonic_ns(), (speed * math.cos(angle), speed * math.sin(angle), 0.3))
@@ -577,7 +577,7 @@ _WORK: Final[dict[str, Callable[[Any, _Turn, int], None]]] = {"vehicle": _produc
 
 @dataclass(frozen=True, slots=True)
 class Fleet:
-    """Drones in a world: how many, which model, and whether firmware that reads all instruments flies them."""
+    """Drones in a world: their number, their model, and whether firmware that reads all instruments flies them."""
 
     world: str
     drones: int
@@ -585,8 +585,8 @@ class Fleet:
     firmware: bool = False
 
 
-#: The fleets to measure: free flight in an open hall; a hundred drones crowded among gates, some touching them; and
-#: drones modelled down to their rotors in steps of a millisecond, one of them with all instruments.
+#: The fleets to measure: drones in free flight in an open hall; a hundred drones crowded among gates, some of them
+#: touching the gates; and drones modelled down to their rotors in steps of a millisecond, one with all instruments.
 FLEETS: Final = (
     Fleet("empty", 1),
     Fleet("empty", 10),
@@ -596,20 +596,20 @@ FLEETS: Final = (
     Fleet("street", 1, "racer", firmware=True),
     Fleet("empty", 100, "crazyflie"),
 )
-SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 for the cameras' own size, and 2
+SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 is the cameras' own size, 2 is twice as wide
 CAMERAS_AT_ONCE: Final = 10
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
-FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; between images, the drones fly for one period
-#: Steps per batch: a multiple of all periods, so that every batch does the same work.
+FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; the drones fly for one period between images
+#: Number of steps per batch: a multiple of all periods, which makes every batch do the same work.
 BATCH_STEPS: Final = 100
-LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if there is little time
-_TAKE_OFF_S: Final = 5.0  # simulated time before measuring begins
+LEAST_ROUNDS: Final = 3  #: minimum number of rounds, even if little time is available
+_TAKE_OFF_S: Final = 5.0  # simulated time before a measurement begins
 #: The drone flies circles with a radius of half a metre, fast enough for rotation to blur the front camera's images.
 _CIRCLING: Final = Velocity(forward=0.5, yaw_rate=1.0)
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
-    """Drones that fly circles, or that firmware makes fly straight up and down, without rendering.
+    """Results for drones that fly circles, or that firmware flies straight up and down, without rendering.
 
     ``step`` is the time per step, measured over batches of :data:`BATCH_STEPS`.
     """
@@ -617,13 +617,13 @@ class PhysicsRow(msgspec.Struct, frozen=True):
     world: str
     drones: int
     step: Spread
-    real_time: float  #: simulated seconds per second
+    real_time: float  #: simulated seconds per second of real time
     model: str = "quadrotor"
     firmware: bool = False
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Rendering, including the sensor's flaws. ``round`` is the time for ``pictures`` images."""
+    """Results for rendering, including the sensor's flaws. ``round`` is the time for ``pictures`` images."""
 
     cameras: str
     width: int
@@ -642,10 +642,9 @@ class SimResults(msgspec.Struct, frozen=True):
 
 
 def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None) -> SimResults:
-    """Measure physics and rendering for about ``seconds`` on the calling thread, limiting OpenCV to that thread.
+    """Measure physics and rendering for about ``seconds`` on the calling thread; OpenCV uses only that thread.
 
-    Building the scenes takes additional time. If Numba is installed, compiled code renders all images, including the
-    first.
+    Building the scenes takes additional time. If Numba is installed, compiled code renders even the first image.
     """
     from skyloop.sim.render.compiled import COMPILER
 
@@ -682,7 +681,7 @@ def _measure_physics(fleet: Fleet, seconds: float, progress: Callable[[float], N
 
 
 def _measure_pair(factor: float, seconds: float, progress: Callable[[float], None]) -> list[DrawingRow]:
-    """Render a drone's two cameras in turn, with images ``factor`` times as wide as the cameras' own."""
+    """Render a drone's two cameras in turn; images are ``factor`` times as wide as the cameras' own."""
     from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
@@ -697,7 +696,7 @@ def _measure_pair(factor: float, seconds: float, progress: Callable[[float], Non
 
 
 def _measure_many(seconds: float, progress: Callable[[float], None]) -> DrawingRow:
-    """Render the front cameras of drones that see one another."""
+    """Render the front cameras of drones that see each other."""
     from skyloop.sim.camera import FRONT_CAMERA
 
     flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
@@ -711,7 +710,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
 
 
 class Flight:
-    """Drones that circle in the furnished room, with cameras that capture images in turn."""
+    """Drones that fly circles in the furnished room, with cameras that take turns capturing images."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
         from skyloop.sim import STEP_S
@@ -722,12 +721,12 @@ class Flight:
         self._cameras = [(drone, model, SensorEffects(model, n)) for n, (drone, model) in enumerate(cameras)]
         self._steps = max(1, math.floor(1.0 / (FRAMES_PER_S * STEP_S * len(cameras))))
         self._number = 0
-        self.picture: Image = np.empty(0, np.uint8)  #: the last image, BGR, shape (height, width, 3)
+        self.picture: Image = np.empty(0, np.uint8)  #: last image, BGR, shape (height, width, 3)
         for at in range(len(cameras)):
             self.draw(at)  # the first image of each lens also computes its tables
 
     def draw(self, at: int) -> int:
-        """Advance the flight, then render a camera's view with its sensor's flaws; return the rendering time [ns]."""
+        """Advance the flight, then render a camera's view with its sensor's flaws; return the time this took [ns]."""
         from skyloop.sim.render import SceneState
 
         simulation, (drone, model, effects) = self._simulation, self._cameras[at]
@@ -747,7 +746,7 @@ class _Hops:
     """Firmware that makes a drone hop. It reads all sensors but computes nothing from them."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return full thrust near the ground and no thrust above."""
+        """Return full thrust near the ground and zero thrust above."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 
@@ -763,7 +762,7 @@ def _flown_by_firmware(fleet: Fleet) -> Simulation:
 
 
 def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
-    """Create a world with drones that have taken off and fly in circles."""
+    """Create a world with drones that have taken off and fly circles."""
     from skyloop.sim import STEP_S, Simulation, load_world
     from skyloop.sim.vehicles import VEHICLES
 
@@ -776,7 +775,7 @@ def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
 
 
 def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
-    """Yield until time is up, but at least :data:`LEAST_ROUNDS` times."""
+    """Yield until the time is up, but at least :data:`LEAST_ROUNDS` times."""
     begin, limit = time.monotonic_ns(), round(seconds * 1e9)
     done = 0
     while done < LEAST_ROUNDS or time.monotonic_ns() - begin < limit:
@@ -787,7 +786,7 @@ def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """Limit OpenCV to the calling thread; restore its number of threads afterwards."""
+    """Limit OpenCV to the calling thread; afterwards, restore its number of threads."""
     from skyloop.sim.render import use_one_core
     from skyloop.sim.render.quads import cv2
 

@@ -1,4 +1,4 @@
-"""Camera calibrations as JSON files: the intrinsics, the image size, and the accuracy."""
+"""Read and write camera calibrations as JSON files: the intrinsics, the image size, and the accuracy."""
 
 from __future__ import annotations
 
@@ -12,30 +12,30 @@ from skyloop import files
 from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
-MAX_BYTES: Final = 1 << 20  #: maximum size of a file; a calibration takes less than a kilobyte
+MAX_BYTES: Final = 1 << 20  #: maximum size of a file [bytes]; a calibration takes less than 1000
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-_SAME_SHAPE = 0.01  # tolerance when comparing aspect ratios, because the sizes of small images are rounded
+_SAME_SHAPE = 0.01  # tolerance for comparing aspect ratios; the sizes of small images are rounded
 
 
 class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A camera calibration by :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for impossible values."""
+    """A camera calibration made by :func:`skyloop.vision.calibrate`; raises :class:`UsageError` for invalid values."""
 
     width: _Side  #: width of the images [px]
     height: _Side
     model: str  #: ``pinhole`` or ``fisheye``
-    fx: float  #: focal length [px]; like all parameters, for images of this size
+    fx: float  #: focal length [px]; all parameters are for images of this size
     fy: float
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()  #: distortion coefficients, as in :class:`Intrinsics`
     rms_px: float | None = None  #: root mean square reprojection error of the corners
-    views: _Count = 0  #: number of images of the board that were used
+    views: _Count = 0  #: number of images of the board that the calibration used
     rejected: _Count = 0  #: number of images rejected as outliers
     coverage: float | None = None  #: fraction of the image area in which corners were seen, 0 to 1
     fx_deviation: float | None = None  #: standard deviation of the focal length [px], estimated from the corners
-    camera: str = ""  #: name of the camera, only for display
+    camera: str = ""  #: name of the camera, for display only
 
     def __post_init__(self) -> None:
         if self.model not in _LENGTHS:
@@ -79,5 +79,5 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
 
 def load_calibration(path: str | Path) -> Calibration:
-    """Read a calibration file. Raises :class:`FileFormatError` if it can't be read or is not a calibration."""
+    """Read a calibration file. Raises :class:`FileFormatError` if the file can't be read or contains no calibration."""
     return files.read_json(path, Calibration, "a camera calibration", MAX_BYTES)

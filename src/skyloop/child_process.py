@@ -1,10 +1,10 @@
-"""Child processes that end with their parent, and objects that are safe after a fork.
+"""Run child processes that end with their parent, and protect objects after a fork.
 
-A child's standard input is a pipe into which nothing is written. When the parent closes its end or dies for any reason,
+A child's standard input is a pipe to which nothing is written. When the parent closes its end, or dies for any reason,
 the child reads the end of file (:func:`on_parent_end`) and exits, too.
 
 A child made by ``os.fork`` is different: it has copies of its parent's objects but not its threads, and destroying the
-copies would destroy resources that the parent is still using (:func:`leave_to_parent`).
+copies would destroy resources that the parent still uses (:func:`leave_to_parent`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, Final, Protocol
 
-GRACE_S: Final = 4.0  #: time for a child to exit on request, and again after being terminated
-_TAIL: Final = 2000  # bytes of a child's standard error shown in an error
-_LOOK_S: Final = 0.25  # how often to check a child that may fall silent
-#: Time limit for reading a dead child's output, because a grandchild can keep the pipe open.
+GRACE_S: Final = 4.0  #: time limit for a child to exit on request, and again after it is terminated
+_TAIL: Final = 2000  # bytes of a child's standard error that an error message shows
+_LOOK_S: Final = 0.25  # how often to check a child that may hang silently
+#: Time limit for reading a dead child's output, because a grandchild may keep the pipe open.
 _DRAIN_S: Final = 1.0
-#: Variable that hands data to a child: only its user can read its environment, but all users can read command lines.
+#: Variable that passes data to a child. Only its user can read its environment, but all users can read command lines.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
 _log = logging.getLogger(__name__)
 
@@ -34,9 +34,9 @@ class LeftToParent(Protocol):
     """An object that belongs to the process that created it."""
 
     def forked(self) -> None:
-        """In a child created by ``os.fork``: keep all later calls away from the parent's resources.
+        """In a child created by ``os.fork``: keep all later calls from touching the parent's resources.
 
-        The child has no other threads, and locks they held may never be released, so don't acquire any.
+        The child has no other threads, and locks that they held may never be released. Therefore acquire no locks.
         """
 
 
@@ -45,7 +45,7 @@ _left_lock: Final = threading.RLock()
 
 
 def leave_to_parent(owner: LeftToParent) -> None:
-    """Call ``owner.forked()`` in each child created by ``os.fork``, for as long as ``owner`` is in use."""
+    """Call ``owner.forked()`` in each child created by ``os.fork``, as long as ``owner`` is in use."""
     with _left_lock:
         _left.add(owner)
 
@@ -57,12 +57,12 @@ def _leave_all() -> None:
     _left.clear()
 
 
-if hasattr(os, "register_at_fork"):  # where there is no fork, nothing is inherited
+if hasattr(os, "register_at_fork"):  # without fork, a child inherits nothing
     os.register_at_fork(before=_left_lock.acquire, after_in_parent=_left_lock.release, after_in_child=_leave_all)
 
 
 class ChildProcess:
-    """A child in its own session, so that Ctrl-C in the terminal reaches only the parent. Any thread."""
+    """A child process in its own session: Ctrl-C in the terminal reaches only the parent. Any thread."""
 
     def __init__(
         self,
@@ -74,9 +74,9 @@ class ChildProcess:
     ) -> None:
         """Start the child.
 
-        ``keep_errors``: whether to keep its standard error for :attr:`last_words`; if False, it goes to this process's.
-        ``inherited``: file descriptors that it inherits. ``handed``: data for :func:`handed_over` that must not be on a
-        command line, which all users can read.
+        ``keep_errors``: whether to keep the child's standard error for :attr:`last_words`; if False, it goes to the
+        parent's standard error. ``inherited``: file descriptors that the child inherits. ``handed``: data for
+        :func:`handed_over` that must not be on a command line, which all users can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
         self._last_words = ""
@@ -101,13 +101,13 @@ class ChildProcess:
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Leave the child to the process that started it; close the copy of the pipe that keeps it running."""
+        """Leave the child to the process that started it; close our copy of the pipe that keeps it running."""
         self.part()
         self._ours = False
 
     @property
     def code(self) -> int | None:
-        """Exit code, negative for a signal; None while it runs."""
+        """Exit code, negative for a signal; None while the child runs."""
         return self._process.poll()
 
     @property
@@ -115,30 +115,30 @@ class ChildProcess:
         """Return the end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._last_words
-        number = self._errors.fileno()  # don't seek, because the child writes at this file's position
+        number = self._errors.fileno()  # don't seek, because the child writes at the position of this file
         size = os.fstat(number).st_size
         return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
 
     @property
     def ending(self) -> str:
-        """How the child ended, worded to follow its name."""
+        """How the child ended, phrased to follow its name."""
         code = self.code
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
     @property
     def quoted_output(self) -> str:
-        """Return the end of its standard error, formatted for appending to a message; empty if it wrote nothing."""
+        """Return the end of the child's standard error, formatted to follow a message; empty if there is none."""
         text = self.last_words
         return f"; its output:\n{text}" if text else ""
 
     def part(self) -> None:
-        """Ask the child to exit by closing its standard input. Does not wait. Idempotent."""
+        """Ask the child to exit, by closing its standard input. Does not wait. Idempotent."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()
 
     def terminate(self) -> None:
-        """Send the child SIGTERM. Does not wait. Idempotent."""
+        """Send SIGTERM to the child. Does not wait. Idempotent."""
         if self._ours:
             self._process.terminate()
 
@@ -154,7 +154,7 @@ class ChildProcess:
         return None
 
     def end(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """Ask the child to exit and wait [s]; then terminate it and wait; finally kill it. Idempotent."""
+        """Ask the child to exit and wait [s]; if necessary, terminate it and wait; finally, kill it. Idempotent."""
         if not self._ours:
             return
         self.part()
@@ -165,15 +165,15 @@ class ChildProcess:
                 self._process.wait()
 
     def close(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End the child like :meth:`end`, then close its output, which no thread may still be reading. Idempotent."""
+        """End the child as :meth:`end` does, then close its output; no thread may still be reading it. Idempotent."""
         if not self._ours:
-            return  # a thread that does not exist after the fork may have left its output locked
+            return  # a thread that no longer exists after the fork may have locked its output
         self.end(grace_s, harder_s)
         self.stdout.close()
         self.close_errors()
 
     def close_errors(self) -> None:
-        """Keep only the end of its standard error. Idempotent."""
+        """Keep only the end of the child's standard error. Idempotent."""
         if self._errors is not None and not self._errors.closed:
             self._last_words = self.last_words
             self._errors.close()
@@ -181,10 +181,10 @@ class ChildProcess:
 
 @contextmanager
 def interrupt_deferred() -> Iterator[threading.Event]:
-    """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at its end.
+    """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at the end of the block.
 
-    Used to end several flights, where an exception midway would skip the remaining ones. Does nothing on threads other
-    than the main one, or if the program handles Ctrl-C itself.
+    Used to end several flights, where an exception in between would skip the remaining flights. Does nothing outside
+    the main thread, or if the program handles Ctrl-C itself.
     """
     noted = threading.Event()
     on_main = threading.current_thread() is threading.main_thread()
@@ -201,14 +201,14 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return the data passed by the parent outside the command line, on the first call only; None if there are none."""
+    """Return the data that the parent passed outside the command line, on the first call only; None without data."""
     return os.environ.pop(_HANDED, None)
 
 
 class RestartingChild:
-    """Keeps one child running, restarting it whenever it ends, until :meth:`stop`. Any thread.
+    """Keeps one child running until :meth:`stop`, restarting it whenever it ends. Any thread.
 
-    All decisions are made under one lock, so that no child starts after :meth:`request_stop`, and every child is ended.
+    All decisions are made under one lock: no child starts after :meth:`request_stop`, and every child is ended.
     """
 
     def __init__(
@@ -223,15 +223,15 @@ class RestartingChild:
         keep_errors: bool = False,
         handed: str | None = None,
     ) -> None:
-        """Prepare; :meth:`start` starts the first child.
+        """Prepare to run children; :meth:`start` starts the first one.
 
         Args:
-            command: Command line of the children.
+            command: Command line of each child.
             name: Name of the threads.
-            read: Reads a child's ``stdout`` to its end, on a separate thread for each child.
+            read: Reads a child's ``stdout`` to its end, on a separate thread per child.
             ended: Called with a readable description when a child has ended, or with None if a child could not be
-                started. Returns the pause before the next start [s]; None for no restart.
-            started: Called with each child, under the lock, before its output is read; must be quick.
+                started. Returns the pause before the next start [s], or None to start no other child.
+            started: Called with each child under the lock, before its output is read; must return quickly.
             silent: Returns whether the current child hangs and must be killed; called four times a second.
             keep_errors: See :class:`ChildProcess`.
             handed: See :class:`ChildProcess`.
@@ -248,7 +248,7 @@ class RestartingChild:
         self._reader: threading.Thread | None = None
         self._name = name
         self._keeper = threading.Thread(target=self._keep, name=name, daemon=True)
-        self.child: ChildProcess | None = None  #: the current child, or the last one; None before the first
+        self.child: ChildProcess | None = None  #: the current or last child; None before the first one
         self.restarts = 0
 
     @property
@@ -258,23 +258,23 @@ class RestartingChild:
 
     @property
     def over(self) -> bool:
-        """Whether the last child has ended and no more will be started."""
+        """Whether the last child has ended and no more children will be started."""
         return not self._keeper.is_alive()
 
     def start(self) -> None:
-        """Start the first child, once. Raises ``OSError`` if it can't be started."""
+        """Start the first child; later calls do nothing. Raises ``OSError`` if it can't be started."""
         self._begin()
         self._keeper.start()
 
     def request_stop(self) -> ChildProcess | None:
-        """Don't start any more children. Returns the current one, which keeps running. Does not wait. Idempotent."""
+        """Don't start any more children. Returns the current child, which keeps running. Does not wait. Idempotent."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
             return self.child
 
     def stop(self, grace_s: float = GRACE_S, harder_s: float = GRACE_S) -> None:
-        """End the current child like :meth:`ChildProcess.end`, and don't start any more. Idempotent."""
+        """End the current child as :meth:`ChildProcess.end` does, and start no more children. Idempotent."""
         child = self.request_stop()
         if child is not None:
             child.end(grace_s, harder_s)
@@ -299,7 +299,7 @@ class RestartingChild:
             _log.exception("killing a child process whose output can't be read")
             child.kill()
         finally:
-            child.stdout.close()  # only here: closing a stream that another thread reads would block
+            child.stdout.close()  # close it only here: closing a stream that another thread reads would block
 
     def _keep(self) -> None:
         child, ending = self.child, ""
@@ -314,7 +314,7 @@ class RestartingChild:
                 self.restarts += 1
             try:
                 child = self._begin()
-            except OSError as error:  # memory or descriptors are temporarily exhausted
+            except OSError as error:  # memory or descriptors are exhausted for now
                 child, ending = None, f"could not be started: {error}"
                 continue
             if child is None:
@@ -336,11 +336,11 @@ class RestartingChild:
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
-    ``descriptor`` is the pipe's reading end, by default standard input, as in a :class:`ChildProcess`.
+    ``descriptor`` is the reading end of the pipe; the default is standard input, as in a :class:`ChildProcess`.
     """
 
     def watch() -> None:
-        with suppress(OSError):  # if it can't be read, treat it as closed
+        with suppress(OSError):  # if the pipe can't be read, treat it as closed
             while os.read(descriptor, 64):
                 pass
         stop()

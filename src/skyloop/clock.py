@@ -1,7 +1,7 @@
-"""Times and clocks. All times are integer nanoseconds on a monotonic clock; decisions take the time as an argument.
+"""Times and clocks. All times are integer nanoseconds on a monotonic clock, and decisions take the time as an argument.
 
-``time.monotonic_ns`` is ``CLOCK_MONOTONIC``, which all processes of a host share, so ages across processes need not be
-estimated. Time namespaces, as in containers, are an exception: :func:`clock_identity` tells them apart. Ages never
+``time.monotonic_ns`` is ``CLOCK_MONOTONIC``. All processes of a host share it, and ages across processes need no
+estimate. Time namespaces, as in containers, are an exception: :func:`clock_identity` distinguishes them. Ages never
 depend on wall-clock time.
 """
 
@@ -14,12 +14,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-#: A time source: returns integer nanoseconds that never decrease.
+#: A time source; returns integer nanoseconds that never decrease.
 Clock = Callable[[], int]
 
 NS_PER_S: Final = 1_000_000_000
-#: Time after which a thread releases the interpreter lock in a process that serves vehicles. With Python's default of
-#: 5 ms, each packet in a flood could delay a command by that much.
+#: Time after which a thread releases the interpreter lock, in a process that serves vehicles. With Python's default of
+#: 5 ms, each packet in a flood could delay a command by 5 ms.
 SWITCH_INTERVAL_S: Final = 0.001
 
 monotonic_ns: Clock = time.monotonic_ns
@@ -32,15 +32,15 @@ def seconds(ns: int) -> float:
 
 
 def nanoseconds(s: float) -> int:
-    """Convert seconds to whole nanoseconds, rounded to nearest."""
+    """Convert seconds to whole nanoseconds, rounded to the nearest."""
     return round(s * NS_PER_S)
 
 
 def slept_ns() -> int:
     """Return how long this computer has slept since it was started [ns]; 0 if unknown.
 
-    The monotonic clock stops during sleep, so anything received earlier is older than its timestamp suggests. The
-    result may be briefly out of date, but is never too large.
+    The monotonic clock stops during sleep: anything received earlier is older than its timestamp suggests. The result
+    may be out of date for a moment, but is never too large.
     """
     if _BOOTTIME is None:
         return 0
@@ -48,7 +48,7 @@ def slept_ns() -> int:
 
 
 def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
-    """Yield once per period, with absolute deadlines, until ``ended`` is set; missed periods are skipped."""
+    """Yield once per period, with absolute deadlines, until ``ended`` is set; skip missed periods."""
     due_s = time.monotonic()
     while True:
         due_s = max(due_s + period_s, time.monotonic())
@@ -68,9 +68,9 @@ def boot_id() -> str:
 
 @functools.cache
 def clock_identity() -> str:
-    """Return an identifier of this process's monotonic clock; processes with the same one read the same clock.
+    """Return an identifier of this process's monotonic clock; processes with equal identifiers read the same clock.
 
-    It combines the kernel's boot ID and the time namespace, and is empty if the boot ID is unknown.
+    It combines the kernel's boot ID and the time namespace. It is empty if the boot ID is unknown.
     """
     if not (boot := boot_id()):
         return ""
@@ -82,7 +82,7 @@ def clock_identity() -> str:
 
 
 class ManualClock:
-    """A clock that moves only when advanced, for tests and for simulation faster than real time."""
+    """A clock that moves only when advanced, for tests and faster-than-real-time simulation."""
 
     def __init__(self, start_ns: int = NS_PER_S) -> None:
         self.now_ns = start_ns
@@ -100,10 +100,10 @@ class ManualClock:
 
 
 class LiveClock:
-    """Maps a live stream's timestamps to this host's clock, taking the smallest recent delay as zero.
+    """Maps the timestamps of a live stream to this host's clock, taking the smallest recent delay as zero.
 
-    Two time windows, of which one is always complete, allow for a stream whose clock runs slightly slower. Times never
-    decrease, and are never in the future.
+    It uses two time windows, one of which is always complete, to allow for a stream whose clock runs slightly slower.
+    The resulting times never decrease and are never in the future.
     """
 
     def __init__(self, window_s: float = 5.0) -> None:
@@ -114,13 +114,13 @@ class LiveClock:
         self._begun_ns = 0
 
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
-        """Return when a frame was captured, which is never later than it arrived.
+        """Return the time at which a frame was captured, which is never later than its arrival.
 
-        ``stamp_s`` is its timestamp on the stream's clock [s]; if that clock jumps back, the estimate restarts.
-        ``arrived_ns`` is on this host's monotonic clock.
+        ``stamp_s`` is the frame's timestamp on the stream's clock [s]; if that clock jumps back, the estimate restarts.
+        ``arrived_ns`` is the arrival time on this host's monotonic clock.
         """
         stamp_ns = nanoseconds(stamp_s)
-        if stamp_ns < self._stamp_ns:  # the stream's clock jumped back, so reset the estimate
+        if stamp_ns < self._stamp_ns:  # the stream's clock jumped back: reset the estimate
             self._before_ns = self._smallest_ns = None
         self._stamp_ns = stamp_ns
         offset_ns = arrived_ns - stamp_ns

@@ -1,4 +1,4 @@
-"""All errors that Skyloop raises on purpose, in one hierarchy.
+"""Define all errors that Skyloop raises on purpose, in one hierarchy.
 
 ::
 
@@ -19,7 +19,7 @@
     ├── SwarmError                        some drones of a swarm failed; carries ``errors`` by name
     └── DriverError                       the vehicle's driver failed; carries what the vehicle reported
 
-The leaves name the cause and the phase; catch the branch that covers all errors you can handle.
+The leaves name the cause and the phase; catch the branch that covers all errors that you can handle.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from typing import Final, Self
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to ``most`` characters, keeping its beginning and end, because either may give the cause.
+    """Shorten a text to ``most`` characters; keep its beginning and end, because either may contain the cause.
 
-    Characters that can't be encoded as UTF-8, for example from invalid file names, become question marks.
+    Characters that can't be encoded as UTF-8, for example in invalid file names, become question marks.
     """
     text = text.encode("utf-8", "replace").decode("utf-8")
     if len(text) <= most:
@@ -44,7 +44,7 @@ def shortened(text: str, most: int) -> str:
 
 
 class Hint(StrEnum):
-    """A possible remedy for an error. ``str(error)`` ends with it, worded for Python; the CLI has its own wording."""
+    """A possible remedy for an error. ``str(error)`` ends with it, worded for Python; the CLI words it differently."""
 
     SEARCH_NETWORK = "search the network"
     NAME_NETWORK = "name the network"
@@ -65,7 +65,7 @@ _IN_PYTHON: Final = {
 class SkyloopError(Exception):
     """Base class of all errors that Skyloop raises on purpose."""
 
-    hint: Hint | None = None  #: a possible remedy, for programs with their own wording; None if the message is complete
+    hint: Hint | None = None  #: a possible remedy, for programs that word it themselves; None: the message is complete
 
     def with_hint(self, hint: Hint) -> Self:
         """Add a hint and return this error."""
@@ -82,20 +82,20 @@ class SkyloopError(Exception):
 
 
 class UsageError(SkyloopError, ValueError):
-    """Raised when an argument is of the wrong type, not finite, out of range, or otherwise unusable."""
+    """Raised when an argument has the wrong type, is not finite or out of range, or is otherwise unusable."""
 
 
 class UnknownNameError(UsageError, KeyError):
-    """Raised when a name is unknown; ``suggestions`` holds the nearest known names, best first."""
+    """Raised when a name is unknown; ``suggestions`` lists the most similar known names, best first."""
 
     def __init__(self, kind: str, name: str, known: Iterable[str], *, where: str = "") -> None:
-        """Compose the message, with suggestions; ``where`` follows the name, as in ``on the network``."""
+        """Compose the message, including suggestions; ``where`` follows the name, as in ``on the network``."""
         choices = sorted(set(known))
-        self.kind = kind  #: what the name refers to, for example ``camera``
+        self.kind = kind  #: what the name denotes, for example ``camera``
         self.name = name  #: the name that was given
         self.known = choices  #: all known names, sorted
         self.where = where
-        #: Up to three similar known names.
+        #: Up to three known names that are similar.
         self.suggestions: list[str] = difflib.get_close_matches(name, choices, n=3, cutoff=0.5)
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
@@ -104,43 +104,43 @@ class UnknownNameError(UsageError, KeyError):
             hint = f"known: {shown}"
         else:
             hint = "none is known here"
-        #: The error's text.
+        #: The error message.
         self.message = f"no {kind} named {name!r}{f' {where}' if where else ''}; {hint}"
         super().__init__(self.message)
 
     @property
-    def reason(self) -> str:  # KeyError would show the repr of the message
+    def reason(self) -> str:  # KeyError would return the repr of the message
         """The message without the hint."""
         return self.message
 
-    def __reduce__(self) -> tuple[object, ...]:  # errors from worker processes are pickled
+    def __reduce__(self) -> tuple[object, ...]:  # worker processes pickle their errors
         return partial(type(self), where=self.where), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
 class FileFormatError(UsageError):
-    """Raised when a file cannot be parsed; the message names the file and, where known, the place in it."""
+    """Raised when a file cannot be parsed; the message names the file and, if known, the place in it."""
 
 
 class NameTakenError(UsageError):
-    """Raised when the requested name is already in use; the message says what uses it."""
+    """Raised when the requested name is already in use; the message tells what uses it."""
 
 
 class DecodeError(SkyloopError, ValueError):
-    """Raised for bytes that are not a valid packet, of Skyloop or a vehicle.
+    """Raised when bytes are not a valid packet of Skyloop or of a vehicle.
 
-    The signature, version, kind, length or a value's range is wrong.
+    The signature, version, kind, length or a value is wrong.
     """
 
 
 def install_command(*extras: str) -> str:
-    """Return the command that installs optional parts, by name, both in a checkout and for an installed wheel."""
+    """Return the command that installs the named optional parts, either in a checkout or for an installed wheel."""
     return f"skyloop install {' '.join(extras)}"
 
 
 class MissingExtraError(SkyloopError, ImportError):
     """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``skyloop install``.
 
-    ``what`` is the feature that needs it, and ``cause`` is why the import failed, if known.
+    ``what`` is the feature that needs it; ``cause`` is why the import failed, if known.
     """
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
@@ -160,9 +160,9 @@ class UnsupportedError(SkyloopError):
 
 
 class RefusedError(SkyloopError):
-    """Raised when the other end understood a request and refused it.
+    """Raised when the other end understood a request but refused it.
 
-    ``code`` is the value of a :class:`skyloop.messages.Refusal`, or a code of the client's own, such as ``"busy"``.
+    ``code`` is the value of a :class:`skyloop.messages.Refusal`, or one of the client's own codes, such as ``"busy"``.
     """
 
     def __init__(self, message: str, *, code: str = "refused") -> None:
@@ -171,11 +171,11 @@ class RefusedError(SkyloopError):
 
 
 class AuthorityError(RefusedError):
-    """Raised when a vehicle is commanded, or a parameter written, without holding the authority over it."""
+    """Raised when a vehicle is commanded or a parameter is written without holding the authority over the vehicle."""
 
 
 class ParameterError(RefusedError):
-    """Raised when a parameter can't be written: the value is out of range or of the wrong type, or it is read-only."""
+    """Raised when a parameter can't be written: it is read-only, or the value has the wrong type or is out of range."""
 
 
 class LinkError(SkyloopError):
@@ -187,15 +187,15 @@ class NoAnswerError(LinkError, TimeoutError):
 
 
 class ClosedError(LinkError):
-    """Raised on use of an object that the application has closed."""
+    """Raised when the application uses an object that it has closed."""
 
 
 class SwarmError(SkyloopError):
-    """Raised when an action fails for some drones of a swarm; the message has one line for each of them."""
+    """Raised when an action fails for some drones of a swarm; the message has one line per drone."""
 
     def __init__(self, what: str, errors: Mapping[str, Exception], total: int) -> None:
         """Compose the message; ``what`` is the name of the failed action."""
-        self.errors = dict(errors)  #: the exceptions, by name of the drone
+        self.errors = dict(errors)  #: exceptions, by drone name
         self.total = total  #: number of drones in the swarm
         self._what = what
         lines = "".join(f"\n  {name}: {type(error).__name__}: {error}" for name, error in self.errors.items())
@@ -206,4 +206,4 @@ class SwarmError(SkyloopError):
 
 
 class DriverError(SkyloopError):
-    """Raised when a vehicle's driver fails, or the vehicle refuses a request."""
+    """Raised when a vehicle's driver fails, or when the vehicle refuses a request."""

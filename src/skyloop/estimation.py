@@ -1,7 +1,7 @@
-"""The steps common to all Kalman filters, and the assignment of measurements. Pure.
+"""Provide the steps shared by all Kalman filters, and the assignment of measurements. Pure.
 
-Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001. A state has shape
-(n,), or (n, k) for k states that share one covariance, (n, n).
+Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001. A state has the
+shape (n,), or (n, k) for k states that share one covariance (n, n).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ Array = NDArray[np.float64]
 
 
 def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
-    """Return the transition and process noise over ``dt_s`` for positions, then velocities, each (2·axes, 2·axes).
+    """Return the transition and the process noise over ``dt_s`` for positions, then velocities; each (2·axes, 2·axes).
 
-    The model is continuous white-noise acceleration (section 6.2.2): two predictions equal one over the total time, and
-    within a second the velocity varies by the square root of ``intensity``.
+    The model is continuous white-noise acceleration (section 6.2.2): two predictions equal one prediction over the
+    total time, and within a second the velocity varies by the square root of ``intensity``.
     """
     move = np.eye(2 * axes) + np.eye(2 * axes, k=axes) * dt_s
     wander = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]]) * intensity
@@ -30,11 +30,12 @@ def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
 def corrected(
     state: Array, covariance: Array, off: Array, seen: Array, noise: Array, spread: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return the state and covariance after a measurement, using Joseph's form (section 5.2.6).
+    """Return the state and the covariance after a measurement, using Joseph's form (section 5.2.6).
 
-    This form keeps the covariance positive in spite of rounding. ``off`` is measured minus expected, (m,) or (m, k);
-    ``seen`` the derivative of the measurement with respect to the state, (m, n); ``noise`` the measurement's
-    covariance, (m, m); and ``spread`` the covariance of ``off``, if it doesn't follow from state and ``noise``.
+    This form keeps the covariance positive despite rounding. ``off`` is the measured value minus the expected value,
+    (m,) or (m, k); ``seen`` is the derivative of the measurement with respect to the state, (m, n); ``noise`` is the
+    covariance of the measurement, (m, m); and ``spread`` is the covariance of ``off``, unless it follows from the state
+    and ``noise``.
     """
     if spread is None:
         spread = seen @ covariance @ seen.T + noise
@@ -46,7 +47,7 @@ def corrected(
 def assignment(what: str, extra: str) -> Callable[[Array], tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Return SciPy's ``linear_sum_assignment``, which finds the pairs (rows, columns) with the least total cost.
 
-    Raises :class:`MissingExtraError`, naming the feature and the extra, if SciPy is not installed.
+    Raises :class:`MissingExtraError`, which names the feature and the extra, if SciPy is not installed.
     """
     try:
         from scipy.optimize import linear_sum_assignment

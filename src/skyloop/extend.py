@@ -1,7 +1,7 @@
-"""Access to a drone beyond its public API, for Skyloop's controllers, recorder, cockpit, processors, ROS and CLI.
+"""Access a drone beyond its public API, for Skyloop's controllers, recorder, cockpit, processors, ROS and CLI.
 
-Only the client uses a drone's private attributes; every other package uses this module, which may change with any
-version. All functions are thread-safe and return at once unless their docstring says otherwise.
+Only the client uses a drone's private attributes. Every other package uses this module, which may change in any
+version. All functions are thread-safe and return immediately unless their docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ D = TypeVar("D", bound="Drone")
 
 
 class Known:
-    """What this process knows about a drone. Reading it sends nothing, subscribes to nothing, and never raises."""
+    """What this process knows about a drone. Reading it sends nothing, subscribes to nothing, and raises no errors."""
 
     def __init__(self, drone: Drone) -> None:
         self._drone, state = drone, drone._state
-        self.app: Final = state.app  #: name of this application, as in events
-        self.reach: Final = drone._reach  #: name or address at which others can reach the vehicle; None if they can't
-        self.subscriber: Final = state.video.subscriber  #: unique to this drone object, for :func:`stream_channel`
+        self.app: Final = state.app  #: name of this application, as it appears in events
+        self.reach: Final = drone._reach  #: name or address at which others can reach the vehicle; None: they can't
+        self.subscriber: Final = state.video.subscriber  #: name unique to this drone object, for :func:`stream_channel`
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback, regardless of its age; None before any has arrived."""
+        """The newest feedback, regardless of its age; None before the first sample arrives."""
         return self._drone._state.newest
 
     @property
     def is_ending(self) -> bool:
-        """Whether the flight is ending or the drone is closed, so that commands raise :class:`ClosedError`."""
+        """Whether the flight is ending or the drone is closed; commands then raise :class:`ClosedError`."""
         return self._drone._piloting.ending
 
     @property
@@ -49,62 +49,62 @@ class Known:
 
     @property
     def listeners(self) -> list[Listener[Any]]:
-        """The application's active callbacks."""
+        """Active callbacks of the application."""
         return list(self._drone._state.listeners)
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
-        """Statistics by channel, like :attr:`skyloop.Drone.stats` but without a request to the proxy."""
+        """Statistics by channel, like :attr:`skyloop.Drone.stats`, but without a request to the proxy."""
         return self._drone._state.stats(self._drone._commands.sends)
 
 
 class Commands(Protocol):
-    """This application's commands and their outcomes. Each command is an intent and has a number."""
+    """This application's commands and their outcomes. Each command is an intent, which has a number."""
 
     @property
-    def newest(self) -> AnyAction: ...  #: the set-point being repeated; idle if there is none
+    def newest(self) -> AnyAction: ...  #: the set-point being repeated; ``Idle`` if there is none
     @property
     def intent(self) -> int: ...  #: number of the newest intent
     @property
     def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps the vehicle in the air or brings it there
     @property
-    def may_ask(self) -> bool: ...  #: whether there is a connection on which this application holds the authority
+    def may_ask(self) -> bool: ...  #: whether a connection exists on which this application holds the authority
     @property
-    def told(self) -> Outcome | None: ...  #: the proxy's newest report on these intents
+    def told(self) -> Outcome | None: ...  #: the proxy's newest report about these intents
 
     def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
     def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; may raise NoAnswerError
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
         """Answer a request to hand over the authority; see :meth:`skyloop.client.commands.CommandSender.answer`."""
 
-    # Presence of the person flying. While it is required but lacking, set-points are not repeated and new ones are
-    # refused. Commands that end a flight are sent once, and emergency stops always work.
-    def flown_by_person(self) -> None: ...  #: require their presence from now on
-    def present_until(self, until_ns: int) -> None: ...  #: time on this process's clock [ns]; never shortened
-    def is_present(self, now_ns: int) -> bool: ...  #: also True if no presence is required
+    # Whether the person flying is present. While presence is required but lacking, set-points are not repeated and new
+    # set-points are refused. Commands that end a flight are still sent once, and emergency stops always work.
+    def flown_by_person(self) -> None: ...  #: require the person's presence from now on
+    def present_until(self, until_ns: int) -> None: ...  #: on this process's clock [ns]; never shortens the time
+    def is_present(self, now_ns: int) -> bool: ...  #: also True if presence is not required
 
 
 def commands(drone: Drone) -> Commands:
-    """Return this application's commands and outcomes; :meth:`skyloop.Drone.command` and :func:`ask` send one."""
+    """Return this application's commands and outcomes; :meth:`skyloop.Drone.command` and :func:`ask` send commands."""
     return drone._commands
 
 
 def ask(drone: Drone, action: AnyAction) -> int:
-    """Send ``action``, whose numbers are valid, like :meth:`skyloop.Drone.command`; return the intent's number."""
+    """Send ``action``, whose numbers are valid, as :meth:`skyloop.Drone.command` does; return the intent's number."""
     return drone._commands.ask(action)
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
-    """Hover or land because the library, not a person, has decided to. Never raises.
+    """Hover or land because the library, and not a person, has decided to do so. Never raises.
 
-    Does nothing if others fly the vehicle, if it is landing or returning, or if the application itself landed or
-    stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.
+    Does nothing if someone else flies the vehicle, if it is landing or returning, or if the application itself landed
+    or stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.
 
     Args:
         drone: The drone.
-        reason: Why the library lets go, for the log.
+        reason: Why the library gives up control, for the log.
         land: Whether to land rather than hover.
-        for_good: Whether the application's later commands, except for an emergency stop, raise :class:`ClosedError`.
+        for_good: Whether later commands of the application, except for an emergency stop, raise :class:`ClosedError`.
 
     Returns:
         Whether anything was sent.
@@ -118,14 +118,14 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
     """Connect as a pilot without requesting the authority yet. Waits for the first feedback.
 
     Args:
-        kind: ``Drone``, or a class derived from it.
-        dial: Connects to the proxy, first now and again after each loss.
+        kind: ``Drone``, or a subclass of it.
+        dial: Connects to the proxy, both now and again after each loss.
         app: Name of this application, 1 to 64 characters.
         timeout_s: Time limit for the proxy to answer and to send feedback [s].
         **options: See :class:`skyloop.client.drone.DroneOptions`.
 
     Raises:
-        SkyloopError: The same as for :func:`skyloop.connect`.
+        SkyloopError: The same errors as for :func:`skyloop.connect`.
     """
     drone = kind(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, acquire=False)
@@ -133,7 +133,7 @@ def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **o
 
 
 def connect_to_stop(name: str, app: str) -> Drone:
-    """Connect to a running proxy as a pilot, without waiting for feedback or ever requesting the authority.
+    """Connect to a running proxy as a pilot, without waiting for feedback and without ever requesting the authority.
 
     Raises the same errors as :func:`skyloop.connect`.
     """
@@ -145,9 +145,9 @@ def connect_to_stop(name: str, app: str) -> Drone:
 
 
 def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | None:
-    """If this application flies the vehicle, land (and wait) or hover, depending on ``on_exit``; then close.
+    """If this application flies the vehicle, land (and wait) or hover, depending on ``on_exit``; then close the drone.
 
-    ``report`` is called on this thread with a text for each step. Returns the error, or None if everything worked.
+    ``report`` is called on this thread with a message for each step. Returns the error, or None if everything worked.
     """
     return drone._piloting.end_flight(report)
 
@@ -155,13 +155,13 @@ def end_flight(drone: Drone, report: Callable[[str], object]) -> SkyloopError | 
 def video_channel(
     drone: Drone, camera: str | None = None, *, max_fps: float | None = None, part: tuple[int, int] | None = None
 ) -> VideoChannel:
-    """Return the channel of a camera's frames, which calls its consumers on the receiving thread.
+    """Return the channel of a camera's frames; the channel calls its consumers on the receiving thread.
 
     Args:
         drone: The drone.
-        camera: Name of the camera; None: the vehicle's first.
-        max_fps: Maximum number of frames a second; None: all.
-        part: (k, n): only every n-th frame, starting from k; None: all.
+        camera: Name of the camera; None: the vehicle's first camera.
+        max_fps: Maximum number of frames per second; None: no limit.
+        part: (k, n): only every n-th frame, starting with frame k; None: all frames.
 
     Raises:
         UnknownNameError: If the vehicle has no camera of this name.
@@ -173,7 +173,7 @@ def video_channel(
 
 
 def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[StreamOptions]) -> StreamChannel:
-    """Return the channel of a camera's H.264 frames; without options, these are as encoded by the vehicle itself.
+    """Return the channel of a camera's H.264 frames; without options, frames arrive as the vehicle encoded them.
 
     Consumers are called on the receiving thread. Raises the same errors as :func:`video_channel`.
     """
@@ -181,20 +181,21 @@ def stream_channel(drone: Drone, camera: str | None = None, **how: Unpack[Stream
 
 
 class InboxOptions(TypedDict, total=False):
-    """Options of :func:`inbox`: the samples that a thread waits for."""
+    """Options of :func:`inbox`: the samples for which a thread waits."""
 
-    feedback: bool  #: whether feedback is wanted; the default is True
-    frames: bool  #: whether frames are wanted; the default is True
-    camera: str | None  #: name of the camera; None: the vehicle's first
-    results: bool  #: whether results of processors are wanted
-    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all
-    max_age_s: float | None  #: maximum age of a result [s]; None: any
+    feedback: bool  #: whether feedback is wanted (default: True)
+    frames: bool  #: whether frames are wanted (default: True)
+    camera: str | None  #: name of the camera; None: the vehicle's first camera
+    results: bool  #: whether the results of processors are wanted
+    processors: Iterable[str] | None  #: names of the processors whose results are wanted; None: all processors
+    max_age_s: float | None  #: maximum age of a result [s]; None: no limit
 
 
 def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
-    """Return mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
+    """Return mailboxes for the newest feedback, frame and results; one thread can wait for all of them.
 
-    The mailboxes are a context manager, and fill while it is open. Raises the same errors as :func:`video_channel`.
+    The mailboxes are a context manager, and receive samples while it is open. Raises the same errors as
+    :func:`video_channel`.
     """
     from skyloop.client.telemetry import Mailboxes
 
@@ -204,21 +205,21 @@ def inbox(drone: Drone, **wanted: Unpack[InboxOptions]) -> Mailboxes:
 def join_processor(
     drone: Drone, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
 ) -> Membership:
-    """Become a worker of a processor, as ``skyloop process`` does, until the drone is closed. Waits for the answer.
+    """Become a worker of a processor, as ``skyloop process`` does, until the drone is closed. Waits for an answer.
 
     Args:
         drone: The drone.
         name: Name of the processor.
-        code: Identifies the code, which is the same for all workers with this name; at most 128 characters.
+        code: Identifies the code, which must be the same for all workers with this name; at most 128 characters.
         camera: Name of the camera; None: the vehicle's first.
-        shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
-        timeout_s: How long to wait [s].
+        shared: If True, each frame goes to only one worker; if False, each worker gets all frames.
+        timeout_s: Maximum time to wait [s].
 
     Raises:
-        NameTakenError: If another application runs other code under this name.
+        NameTakenError: If another application runs different code under this name.
         RefusedError: If the proxy refuses for another reason.
         NoAnswerError: If the proxy does not answer in time.
-        UsageError: If ``name`` or ``code`` is unusable, or if called from an inline callback.
+        UsageError: If ``name`` or ``code`` is invalid, or if called from an inline callback.
         UnknownNameError: If the vehicle has no camera of this name.
     """
     from skyloop.client.publishing import Membership

@@ -1,4 +1,4 @@
-"""Inject faults into transports, identically for the same seed. Pure: the sender handles time."""
+"""Inject faults into transports; the same seed gives the same faults. Pure: the sender handles delays."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True, slots=True)
 class Faults:
-    """Faults to inject, as probabilities between 0 and 1 for each packet or frame, in each direction.
+    """Faults to inject, as probabilities from 0 to 1 for each packet or frame in each direction.
 
-    ``corrupt`` flips one random bit, in packets only. ``reorder`` delays an item until after the next one. Each
-    direction of each connection has its own ``random.Random``, seeded from ``seed``.
+    ``corrupt`` flips one random bit, only in packets. ``reorder`` delays an item until after the next item. Each
+    direction of each connection has its own ``random.Random``, which is seeded from ``seed``.
     """
 
     seed: int = 0
@@ -32,7 +32,7 @@ class Faults:
 
 
 class FaultInjector:
-    """Injects the faults for one direction of one connection. Not thread-safe."""
+    """Injects the faults into one direction of one connection. Not thread-safe."""
 
     def __init__(self, faults: Faults, key: str) -> None:
         self._faults = faults
@@ -40,7 +40,7 @@ class FaultInjector:
         self._held: list[object] = []
 
     def packets(self, packet: bytes) -> list[bytes]:
-        """Return what arrives when this packet is sent: any number of packets, in order of their arrival."""
+        """Return what arrives when this packet is sent: any number of packets, in order of arrival."""
         if packet and self._random.random() < self._faults.corrupt:
             damaged = bytearray(packet)
             damaged[self._random.randrange(len(damaged))] ^= 1 << self._random.randrange(8)
@@ -48,7 +48,7 @@ class FaultInjector:
         return self.items(packet)
 
     def items(self, item: _Item) -> list[_Item]:
-        """Do the same for items of any type, but without corruption."""
+        """Do the same as :meth:`packets` for items of any type, but without corruption."""
         held: list[_Item] = self._held  # type: ignore[assignment]
         chance = self._random.random
         if chance() < self._faults.drop:

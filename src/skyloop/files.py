@@ -1,4 +1,4 @@
-"""File access: bounded reading and decoding with a single kind of error, atomic replacement, waiting for data."""
+"""Access files: bounded reading and decoding with one kind of error, atomic replacement, and waiting for data."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from skyloop.errors import FileFormatError, UsageError
 T = TypeVar("T")
 
 MAX_TEXT: Final = 1 << 20  #: maximum size of a hand-written list [bytes]
-MAX_RESULTS: Final = 256 << 20  #: maximum size of a file of measurements [bytes]; an hour's worth takes a few megabytes
+MAX_RESULTS: Final = 256 << 20  #: maximum size of a file of measurements [bytes]; an hour takes a few megabytes
 
 
 def read_bytes(path: str | Path, what: str, most: int) -> bytes:
-    """Read a file of at most ``most`` bytes. ``what`` describes its content in error messages.
+    """Read a file of at most ``most`` bytes. ``what`` describes the content in error messages.
 
-    Raises :class:`FileFormatError` if it can't be read or is larger.
+    Raises :class:`FileFormatError` if the file can't be read or is larger.
     """
     try:
         with expand(path).open("rb") as file:
@@ -37,15 +37,12 @@ def read_bytes(path: str | Path, what: str, most: int) -> bytes:
 
 
 def decoded(content: bytes) -> str:
-    """Decode UTF-8, dropping the byte order mark that Windows editors add.
-
-    Raises :class:`UnicodeDecodeError`.
-    """
+    """Decode UTF-8, and drop the byte order mark that Windows editors add. Raises :class:`UnicodeDecodeError`."""
     return content.decode("utf-8-sig")
 
 
 def read_text(path: str | Path, what: str, most: int) -> str:
-    """Read a text file, like :func:`read_bytes`; see :func:`decoded`."""
+    """Read a text file with the limits of :func:`read_bytes`; see :func:`decoded`."""
     try:
         return decoded(read_bytes(path, what, most))
     except UnicodeDecodeError as error:
@@ -53,7 +50,7 @@ def read_text(path: str | Path, what: str, most: int) -> str:
 
 
 def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
-    """Read a JSON file as an instance of a type, like :func:`read_bytes`."""
+    """Read a JSON file as an instance of ``kind``, with the limits of :func:`read_bytes`."""
     content = read_bytes(path, what, most)
     try:
         return msgspec.json.decode(decoded(content), type=kind)
@@ -68,9 +65,9 @@ class Descriptor(Protocol):
 
 
 def wait_readable(source: Descriptor | int, within_s: float) -> bool:
-    """Wait until a descriptor is readable or closed; return False if it is neither within ``within_s`` [s].
+    """Wait until a descriptor is readable or closed; return False if neither happens within ``within_s`` [s].
 
-    Works for any descriptor number; ``select.select`` raises from 1,024 on.
+    Works for any descriptor number; ``select.select`` raises an error from 1,024 on.
     """
     if not hasattr(select, "poll"):  # Windows
         return bool(select.select([source], [], [], within_s)[0])
@@ -80,7 +77,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; a path with an unknown user is returned unchanged and won't be found."""
+    """Expand ``~`` to the home directory; return a path with an unknown user unchanged, which won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
@@ -89,11 +86,11 @@ def expand(path: str | Path) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path that replaces ``path`` after the block; on failure ``path`` stays untouched.
+    """Yield a temporary path that replaces ``path`` after the block; on failure, ``path`` stays unchanged.
 
-    Devices and pipes are written to directly. Raises :class:`UsageError` in place of ``OSError``.
+    Devices and pipes are written to directly. Raises :class:`UsageError` instead of ``OSError``.
     """
-    place = Path(os.path.realpath(path))  # if it is a link, replace its target and leave the link in place
+    place = Path(os.path.realpath(path))  # if it is a link, replace the link's target and leave the link in place
     special = place.exists() and not place.is_file()
     part = place if special else place.with_name(f".{place.stem}.{os.getpid()}{place.suffix}")
     try:
@@ -108,7 +105,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Replace a file in one step. Raises :class:`UsageError`."""
+    """Replace a file in a single step. Raises :class:`UsageError`."""
     with replacing(path) as part:
         part.write_bytes(content)
 

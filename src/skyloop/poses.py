@@ -1,8 +1,8 @@
-"""Poses of the body, its cameras and targets, as SciPy's ``RigidTransform``. Needs the extra ``control``.
+"""Compute poses of the body, its cameras and targets, as SciPy's ``RigidTransform``. Requires the extra ``control``.
 
-``a_in_b`` is the pose of ``a`` in the axes of ``b``: it converts a point from ``a``'s axes to ``b``'s. Poses chain with
-``*`` and invert with ``inv()``. World axes: x east, y north, z up; body axes: x forward, y left, z up (ROS REP 103); a
-camera's optical axes: x right, y down, z forward. Metres.
+``a_in_b`` is the pose of ``a`` in the axes of ``b``; it converts a point from ``a``'s axes to ``b``'s axes. ``*``
+chains poses, and ``inv()`` inverts them. World axes are x east, y north, z up; body axes are x forward, y left, z up
+(ROS REP 103); a camera's optical axes are x right, y down, z forward. Metres.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 
 def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
-    """Create a pose from a position (3,) and a rotation matrix (3, 3) or (9,), row by row.
+    """Create a pose from a position (3,) and a rotation matrix, (3, 3) or (9,) row by row.
 
-    Raises :class:`UsageError` if a value is not finite, or the matrix is not a rotation.
+    Raises :class:`UsageError` if a value is not finite or the matrix is not a rotation.
     """
     place = np.asarray(position, dtype=np.float64)
     turn = np.asarray(rotation, dtype=np.float64)
@@ -40,15 +40,15 @@ def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
 
 
 def attitude(feedback: Feedback) -> Rotation:
-    """Return the rotation from body to world axes. Raises :class:`UsageError` while the attitude is unknown."""
+    """Return the rotation from body axes to world axes. Raises :class:`UsageError` while the attitude is unknown."""
     rotation: Rotation = _scipy().Rotation.from_matrix(_rotation(feedback))
     return rotation
 
 
 def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
-    """Return the vehicle's pose; ``position`` (3,) [m], if given, replaces the vehicle's own.
+    """Return the pose of the vehicle; ``position`` (3,) [m], if given, replaces the vehicle's own position.
 
-    Raises :class:`UsageError` while attitude or position is unknown.
+    Raises :class:`UsageError` while the attitude or the position is unknown.
     """
     place = feedback.position_m if position is None else position
     if place is None:
@@ -57,7 +57,7 @@ def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> Rigi
 
 
 def camera_in_body(camera: CameraInfo) -> RigidTransform:
-    """Return the pose in which a camera is mounted; if its position is unknown, the body's centre is assumed.
+    """Return the pose in which a camera is mounted; an unknown position is assumed to be the body's centre.
 
     Raises :class:`UsageError` if its orientation is unknown.
     """
@@ -67,7 +67,7 @@ def camera_in_body(camera: CameraInfo) -> RigidTransform:
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
     """Return a camera's pose when the vehicle is in the state ``feedback`` (``frame.feedback`` for an image).
 
-    ``position`` and errors are the same as for :func:`body_in_world` and :func:`camera_in_body`.
+    ``position`` and the errors are the same as for :func:`body_in_world` and :func:`camera_in_body`.
     """
     return body_in_world(feedback, position) * camera_in_body(camera)
 
@@ -75,12 +75,12 @@ def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike 
 def target_in_world(
     target_in_camera: RigidTransform, camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None
 ) -> RigidTransform:
-    """Return the pose of something seen by a camera, such as :attr:`MarkerSighting.pose`, given ``feedback``."""
+    """Return the pose of something that a camera sees, such as :attr:`MarkerSighting.pose`, given ``feedback``."""
     return camera_in_world(camera, feedback, position) * target_in_camera
 
 
 def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
-    """Return the rotation from a camera's optical axes to body axes, shape (3, 3). Needs no extra.
+    """Return the rotation from a camera's optical axes to body axes, shape (3, 3). Requires no extra.
 
     Raises :class:`UsageError` if the camera's mounting is unknown.
     """

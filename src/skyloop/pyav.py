@@ -1,4 +1,4 @@
-"""Create PyAV's decoders and encoders in one place, because PyAV is optional and is imported when first needed."""
+"""Create PyAV decoders and encoders in one place, because PyAV is optional and is imported when first needed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def require_pyav(purpose: str) -> None:
-    """Raise :class:`MissingExtraError`, which says what it is needed for, unless PyAV is installed."""
+    """Raise :class:`MissingExtraError` unless PyAV is installed; the message states the ``purpose``."""
     try:
         import av  # noqa: F401
     except ImportError as error:
@@ -27,10 +27,10 @@ def require_pyav(purpose: str) -> None:
 def new_decoder(
     codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = False, low_delay: bool = True
 ) -> VideoCodecContext:
-    """Create a decoder that returns each image at once; ``codec`` is FFmpeg's name. See :func:`require_pyav`.
+    """Create a decoder that returns each image immediately; ``codec`` is FFmpeg's name. See :func:`require_pyav`.
 
-    With ``patch``, damaged parts are filled from earlier images; otherwise a damaged image is an error. ``low_delay``
-    is False for a stream whose images depend on later ones and are delayed until those arrive.
+    With ``patch``, damaged parts are filled in from earlier images; otherwise, a damaged image is an error.
+    ``low_delay`` is False for a stream whose images depend on later images and are delayed until those arrive.
     """
     require_pyav(purpose)
     import av
@@ -39,7 +39,7 @@ def new_decoder(
     if patch:
         context.flags |= av.codec.context.Flags.output_corrupt
     else:
-        # For H.264, also refuse an image with leftover bits; for MPEG-4, that check would refuse the end of every
+        # For H.264, also reject an image with leftover bits. For MPEG-4, this check would reject the end of every
         # sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)
@@ -50,28 +50,28 @@ def new_decoder(
 
 
 def limit_memory(context: CodecContext) -> None:
-    """Limit a decoder's memory, because a damaged header must not make it allocate gigabytes."""
+    """Limit a decoder's memory: a damaged header must not make the decoder allocate gigabytes."""
     context.options = {**context.options, "max_pixels": str(MAX_PIXELS)}
 
 
 _TICK: Final = Fraction(1, 1_000_000)  # time base for the encoder's rate control [s]
-#: Fraction of a second's data that a stream may send at once, which limits the size of a key frame. A slow link has to
-#: carry it before the next image.
+#: Time [s] whose share of the data a stream may send at once, which limits the size of a key frame. A slow link has to
+#: transmit it before the next image.
 _BURST_S: Final = 0.15
-_GROWS: Final = 3  # maximum factor by which a variable rate may increase
-_FALLS: Final = 12  # below 1/12 of the maximum rate, a single image occupies the link for too long
-_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames; it can be long because late subscribers request one
-#: Colours as in PAL television, with 16 to 235 from black to white, which FFmpeg converts to and decoders expect.
+_GROWS: Final = 3  # factor by which a variable rate may increase at most
+_FALLS: Final = 12  # below 1/12 of the maximum rate, a single image would occupy the link for too long
+_KEY_EVERY_S: Final = 10.0  #: maximum time between key frames; long, because late subscribers request a key frame
+#: Colours as in PAL television, with values from 16 (black) to 235 (white): FFmpeg produces and decoders expect them.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
 
 class H264Encoder:
-    """Encodes one stream, returning each image at once. Use from one thread at a time.
+    """Encodes one stream and returns each image at once. Use it from one thread at a time.
 
-    H.264, Main profile, Annex B, without images that depend on later ones; parameter sets before each key frame. Width
-    and height [px] must be even. If the average rate [kbit/s] ``varies``, it may increase up to threefold; x264 fixes
-    the largest burst when it starts, so a constant rate is kept more strictly. Raises :class:`MissingExtraError` if
-    PyAV or x264 is missing.
+    The format is H.264, Main profile, Annex B, without images that depend on later images; parameter sets precede each
+    key frame. The width and height [px] must be even. If the average rate [kbit/s] ``varies``, it may increase up to
+    threefold. x264 fixes the largest burst when it starts; a constant rate is therefore kept more strictly. Raises
+    :class:`MissingExtraError` if PyAV or x264 is not installed.
     """
 
     def __init__(self, width: int, height: int, fps: float, kbit_s: int, *, varies: bool = False) -> None:
@@ -102,17 +102,17 @@ class H264Encoder:
             "x264-params": f"repeat-headers=1:scenecut=0:sliced-threads=0:{_COLOURS}",
         }
         context.open()
-        # x264 accepts a later change of rate only if it was started with a maximum rate, and only up to that.
+        # x264 accepts a later change of rate only if it was started with a maximum rate, and only up to that maximum.
         context.bit_rate = kbit_s * 1000
         self._context = context
         self._fresh = True
 
     def carries(self, kbit_s: int) -> bool:
-        """Return whether the encoder can switch to a rate [kbit/s]; if not, create a new one."""
+        """Return whether the encoder can switch to a rate [kbit/s]; if not, a new encoder is needed."""
         return self._most_kbit_s / _FALLS <= kbit_s <= self._most_kbit_s
 
     def set_rate(self, kbit_s: int) -> None:
-        """Change the average rate [kbit/s], starting with the next image, at no cost; see :meth:`carries`."""
+        """Change the average rate [kbit/s] from the next image on, at no cost; see :meth:`carries`."""
         self.kbit_s = kbit_s
         self._context.bit_rate = kbit_s * 1000
 
@@ -124,10 +124,10 @@ class H264Encoder:
         Args:
             pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous; any size is scaled.
             form: FFmpeg's name for the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
-            captured_ns: Capture time [ns], later than the previous one.
-            key: Whether the image becomes a key frame.
+            captured_ns: Capture time [ns], later than that of the previous image.
+            key: Whether to make the image a key frame.
 
-        Returns the access unit, empty if the encoder returned none, and whether it is a key frame.
+        Returns the access unit, which is empty if the encoder returned none, and whether it is a key frame.
         """
         import av
 

@@ -1,6 +1,6 @@
-"""Run processors on a Ray cluster, as ``skyloop process`` does, but in actors placed by Ray. Needs the extra ``ray``.
+"""Run processors on a Ray cluster, as ``skyloop process`` does, but in actors that Ray places. Needs the ``ray`` extra.
 
-Frames and results are exchanged with the proxy as usual; Ray starts the actors, and restarts them when they die.
+Frames and results are exchanged with the proxy as usual. Ray starts the actors, and restarts them if they die.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from skyloop.processing import Code, Settings, Status, Worker, load_processor
 _ASK_S: Final = 10.0  #: time limit for an actor to return its status
 _LOOK_S: Final = 0.1  # how often to check whether all actors have started
 _START_S: Final = 60.0  #: time limit for Ray to place and start all actors
-#: This program's environment variables that a worker needs to find the proxy.
+#: Environment variables of this program that a worker needs to find the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
 
 
 class Workers:
-    """The actors of one processor, created by :func:`process`. As a context manager, it ends them."""
+    """The actors of one processor, created by :func:`process`. It is a context manager, which ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
-        """Keep Ray's handles for the actors."""
+        """Store Ray's handles for the actors."""
         self.actors = actors  #: Ray's handles for the actors
 
     def statuses(self, timeout_s: float = _ASK_S) -> list[Status | None]:
-        """Return each actor's statistics; None for one that does not answer, for example because it is restarting.
+        """Return each actor's statistics; None for an actor that does not answer, for example because it is restarting.
 
         Args:
-            timeout_s: How long to wait for all actors [s].
+            timeout_s: Maximum time to wait for all actors [s].
 
         Raises:
             LinkError: If an actor can't continue, for example because other code took its name; the message says why.
@@ -81,18 +81,18 @@ def process(
     stuck_s: float = 2.0,
     **options: Any,
 ) -> Workers:
-    """Run a processor as actors on a Ray cluster; return when all of them are working.
+    """Run a processor as actors on a Ray cluster; return once all of them are working.
 
-    Uses the cluster that this program is connected to, or else starts one on this host.
+    Uses the cluster to which this program is connected, or else starts a cluster on this host.
 
     Args:
-        target: The class, or its location: ``module:Class`` or ``file.py:Class``.
-        drone: Name or address of the drone, as reachable from each actor's host.
+        target: The processor's class, or its location: ``module:Class`` or ``file.py:Class``.
+        drone: Name or address at which each actor's host can reach the drone.
         workers: Number of actors, at least 1.
-        camera: Name of the camera; None: the vehicle's first.
+        camera: Name of the camera; None: the vehicle's first camera.
         name: Name of the processor; None: the class's name in lower case.
-        shared: If True, each frame goes to one of the workers; if False, each worker gets all frames.
-        max_age_s: Frames older than this when their turn comes are skipped [s]; None: no limit.
+        shared: If True, each frame goes to only one worker; if False, each worker gets all frames.
+        max_age_s: Maximum age of frames [s]; older frames are skipped when they would be processed; None: no limit.
         max_fps: Maximum frame rate of each worker; None: no limit.
         stuck_s: If a call to ``process`` takes longer than this [s], the worker's frames go to the others.
         **options: Options of Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged
@@ -100,9 +100,9 @@ def process(
 
     Raises:
         MissingExtraError: If Ray is not installed.
-        UsageError: If an argument is out of range, or the class is not a processor.
-        NoAnswerError: If Ray finds no room for that many actors within 60 s.
-        LinkError: If an actor fails; the message says why.
+        UsageError: If an argument is out of range, or if the class is not a processor.
+        NoAnswerError: If Ray has no room for this many actors within 60 s.
+        LinkError: If an actor fails; the message gives the reason.
     """
     ray = _ray()
     if not isinstance(workers, int) or workers < 1:
@@ -112,7 +112,7 @@ def process(
     if not ray.is_initialized():
         ray.init(include_dashboard=False, log_to_driver=False)
     module = sys.modules[code.kind.__module__]
-    if module.__name__.startswith("skyloop_user_"):  # it was loaded from a file, which other hosts can't import
+    if module.__name__.startswith("skyloop_user_"):  # it was loaded from a file, and other hosts can't import it
         ray.cloudpickle.register_pickle_by_value(module)
     options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
@@ -126,7 +126,7 @@ def process(
 
 
 def _runtime_env(wanted: Any) -> dict[str, Any]:
-    """Return the user's ``runtime_env``, extended by the variables that an actor needs to find the proxy."""
+    """Return the user's ``runtime_env`` with the variables that an actor needs to find the proxy."""
     wanted = {} if wanted is None else wanted
     variables = wanted.get("env_vars") or {} if isinstance(wanted, Mapping) else None
     if not isinstance(variables, Mapping):
@@ -149,7 +149,7 @@ def _await_start(workers: Workers) -> None:
 
 
 class _Actor:
-    """One worker, on a host chosen by Ray."""
+    """One worker, on a host that Ray chose."""
 
     def __init__(self, kind: type[Any], drone: str, settings: Settings) -> None:
         self._trouble = ""
@@ -183,7 +183,7 @@ class _Actor:
             self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:
-        """Return the worker's statistics and, if it has ended, the reason."""
+        """Return the worker's statistics and, if it has ended, why."""
         return None if self._worker is None else self._worker.status, self._trouble
 
 

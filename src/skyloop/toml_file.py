@@ -1,4 +1,4 @@
-"""Read TOML files into msgspec structs, with errors that give the place, the value and the allowed values."""
+"""Read TOML files into msgspec structs; errors give the place, the value and the allowed values."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from skyloop.errors import FileFormatError
 
 T = TypeVar("T")
 
-MAX_BYTES: Final = 1 << 18  #: maximum size of a file [bytes]; the largest world shipped takes 5 kB
-#: Maximum number of parts in a key. For every key, a parser visits all parts above it: with 10,000, this takes minutes.
+MAX_BYTES: Final = 1 << 18  #: maximum size of a file [bytes]; the largest world included takes 5 kB
+#: Maximum number of parts in a key. For every key, a parser visits all tables above it; 10,000 parts take minutes.
 MAX_DEPTH: Final = 16
-MAX_WHOLE: Final = (1 << 63) - 1  #: TOML's limit; larger numbers are neither shown nor used
-#: Held during conversions: msgspec inspects a struct's fields the first time, and crashes if two threads do so at once.
+MAX_WHOLE: Final = (1 << 63) - 1  #: TOML's limit; larger numbers are neither displayed nor used
+#: Held during conversions: msgspec inspects a struct's fields on first use, and crashes if two threads do so at once.
 _converting = threading.Lock()
-_SHOWN: Final = 80  #: characters of a wrong value in a message
+_SHOWN: Final = 80  #: maximum length of a wrong value in a message [characters]
 # Possessive quantifiers, and matching only at the start of a part, avoid backtracking: a miss is as fast as a match.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
@@ -37,15 +37,15 @@ _KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a t
 class Place:
     """A table in a file, for error messages."""
 
-    source: str  #: the file's name
-    table: str = ""  #: the table's name; empty for top-level keys
+    source: str  #: name of the file
+    table: str = ""  #: name of the table; empty for top-level keys
 
     def under(self, key: str) -> Place:
-        """Return the place of a table inside this one."""
+        """Return the place of a table within this table."""
         return Place(self.source, f"{self.table}.{key}" if self.table else key)
 
     def item(self, key: str, number: int, name: object) -> Place:
-        """Return the place of one table in an array of tables, by its name or its number, counting from 1."""
+        """Return the place of one table in an array of tables, by its name or by its number, counted from 1."""
         place = self.under(key).table
         return Place(self.source, f"{place} {name!r}" if isinstance(name, str) and name else f"{place} #{number}")
 
@@ -55,18 +55,18 @@ class Place:
         return FileFormatError(f"{', '.join(where)}, key {key!r}: {problem}")
 
     def wrong(self, key: str, value: object, wanted: str) -> FileFormatError:
-        """Create an error about a wrong value."""
+        """Create an error about a wrong value of a key."""
         kind = _KINDS.get(type(value), type(value).__name__)
         return self.error(key, f"{_shown(value)} ({kind}) given, but it must be {wanted}")
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), if parsing fails."""
+    """Parse a file's text. Raises :class:`FileFormatError`, which names the file (``source``), on failure."""
     if _DEEP_KEY.search(text):
         raise FileFormatError(f"{source}: a key has more than {MAX_DEPTH} dotted parts")
     try:
         values: dict[str, Any] = msgspec.toml.decode(text)
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # even if it is just too large
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # including values that are just too large
         raise FileFormatError(f"{source}: not valid TOML: {error}") from None
     return values
 
@@ -74,8 +74,8 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
     """Convert the result of :func:`parse_toml` to a struct; unknown keys are errors.
 
-    Its fields may be tables and lists of tables. Raises :class:`FileFormatError` if a key is missing or unknown, or a
-    value has the wrong type or is out of range.
+    The fields of ``kind`` may be tables and lists of tables. Raises :class:`FileFormatError` if a key is missing or
+    unknown, or if a value has the wrong type or is out of range.
     """
     try:
         with _converting:
@@ -85,7 +85,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Add the given value and a hint to msgspec's error, which contains only the place and the expected type."""
+    """Add the given value and a hint to msgspec's error, which names only the place and the expected type."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():
@@ -111,7 +111,7 @@ def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileF
 def _wrong_key(
     place: Place, table: dict[str, Any], fields: dict[str, tuple[inspect.Type, bool]], message: str
 ) -> FileFormatError:
-    """Create the error about an unknown or missing key, or about both if one is a misspelling of the other."""
+    """Create the error for an unknown or missing key, or for both if one is a misspelling of the other."""
     unknown = [key for key in table if key not in fields]
     missing = [key for key, (_, required) in fields.items() if required and key not in table]
     for key in missing:
@@ -126,7 +126,7 @@ def _wrong_key(
 
 
 def _plain(info: inspect.Type) -> Any:
-    """Return a type without its optional and metadata wrappers."""
+    """Return a type without its wrappers for optional values and metadata."""
     if isinstance(info, inspect.Metadata):
         return _plain(info.type)
     if isinstance(info, inspect.UnionType):
@@ -161,7 +161,7 @@ def _choices(info: inspect.Type) -> tuple[str, ...]:
 
 
 def _wanted(info: inspect.Type, place: Place) -> str:
-    """Return a description of what a value must be; ``place`` is the value's place."""
+    """Return a description of the allowed values; ``place`` is where the value is."""
     if isinstance(info, inspect.Metadata) and info.extra_json_schema:
         return str(info.extra_json_schema["description"])
     plain = _plain(info)
@@ -183,7 +183,7 @@ def _wanted(info: inspect.Type, place: Place) -> str:
 
 
 def _range(low: float | None, high: float | None) -> str:
-    """Describe a number between these bounds; if the upper one is the largest float, there is no upper bound."""
+    """Describe a number between these bounds; an upper bound equal to the largest float is left out."""
     least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
     if least and most:
         return f"a number from {low:g} to {high:g}"

@@ -1,6 +1,6 @@
-"""The space in which a vehicle may fly: a room's walls, a safety box and no-fly zones, upright, in world axes. Pure.
+"""Define the space in which a vehicle may fly: a room's walls, a safety box and upright no-fly zones. Pure.
 
-World axes are x east, y north, z up [m]. The proxy decides what a vehicle does near these walls.
+The world axes are x east, y north, z up [m]. The proxy decides how a vehicle may move near these walls.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from typing import Final, NamedTuple
 from skyloop.errors import ParameterError
 from skyloop.messages import Refusal, Value
 
-FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is ignored [m]
+FAR_M: Final = 10_000.0  #: a wall of the safety box is ignored if it is at least this far away [m]
 MAX_ZONES: Final = 32
-#: Thinner zones are enlarged to this thickness [m], so that an overshoot or a gust can't carry a vehicle across.
+#: Thinner zones are enlarged to this thickness [m] to keep an overshoot or a gust from carrying a vehicle across.
 THINNEST_M: Final = 0.5
-BOX: Final = "safety.box"  #: prefix of the box's parameters
+BOX: Final = "safety.box"  #: prefix of the parameters of the safety box
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
-MAX_NAME: Final = 24  #: characters in a zone's name
+MAX_NAME: Final = 24  #: maximum length of a zone's name [characters]
 _SHAPES: Final = {"box": 6, "cylinder": 5}
 _NAME: Final = re.compile(rf"[^:;,\x00-\x1f\x7f]{{1,{MAX_NAME}}}")
 
@@ -30,7 +30,7 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane, given by the unit vector towards it in world axes and its distance [m], which is negative beyond it."""
+    """A plane, given by the unit vector towards it in world axes and by its distance [m]; negative beyond the plane."""
 
     normal: Vec3
     distance: float
@@ -47,7 +47,7 @@ class Box:
     name: str = ""  #: name of the zone, if any
 
     def walls_inside(self, place: Vec3) -> Iterator[Wall]:
-        """Yield the walls of a box that a vehicle must stay inside."""
+        """Yield the walls of a box that a vehicle must not leave."""
         for axis in range(3):
             for sign, distance in ((-1.0, place[axis] - self.low[axis]), (1.0, self.high[axis] - place[axis])):
                 normal = [0.0, 0.0, 0.0]
@@ -67,7 +67,7 @@ class Box:
         )
 
     def holds(self, place: Vec3) -> bool:
-        """Return whether a position is inside or on the surface."""
+        """Return whether a position is inside the box or on its surface."""
         return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
 
     def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
@@ -78,7 +78,7 @@ class Box:
         return first <= last
 
     def thickened(self) -> Box:
-        """Return the box with the same centre, made at least :data:`THINNEST_M` thick along each axis."""
+        """Return a box with the same centre that is at least :data:`THINNEST_M` thick along each axis."""
         x, y, z = (_thickened(low, high) for low, high in zip(self.low, self.high, strict=True))
         low, high = (x[0], y[0], z[0]), (x[1], y[1], z[1])
         return self if (low, high) == (self.low, self.high) else replace(self, low=low, high=high)
@@ -124,12 +124,12 @@ class Cylinder:
             return False
         x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
         length = across * across + along * along
-        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # nearest point of the infinite line
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # nearest point on the infinite line
         share = max(first, min(last, nearest))
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
     def thickened(self) -> Cylinder:
-        """Return the cylinder with the same centre, made at least :data:`THINNEST_M` thick."""
+        """Return a cylinder with the same centre that is at least :data:`THINNEST_M` thick."""
         radius, (low, high) = max(self.radius, THINNEST_M / 2), _thickened(self.low, self.high)
         if (radius, low, high) == (self.radius, self.low, self.high):
             return self
@@ -147,9 +147,9 @@ class Space:
     """The space in which a vehicle may fly."""
 
     room: Box | None = None  #: the room's walls, which the vehicle can't pass; None if unknown
-    box: Box | None = None  #: the safety box; None if there is none
-    zones: tuple[Zone, ...] = ()  #: the no-fly zones, exactly as given
-    #: The zones that are enforced, enlarged to be at least :data:`THINNEST_M` thick.
+    box: Box | None = None  #: safety box; None if there is none
+    zones: tuple[Zone, ...] = ()  #: no-fly zones, exactly as given
+    #: The enforced zones, enlarged to be at least :data:`THINNEST_M` thick.
     barriers: tuple[Zone, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -157,12 +157,12 @@ class Space:
 
     @property
     def walled(self) -> bool:
-        """Whether there are walls that limit set-points; the walls of a room do not."""
+        """Whether any walls limit set-points. The walls of the room never do."""
         return self.box is not None or bool(self.zones)
 
     @property
     def thin(self) -> tuple[Zone, ...]:
-        """The zones that had to be enlarged, as originally given."""
+        """The zones that had to be enlarged, in their original form."""
         return tuple(zone for zone, kept in zip(self.zones, self.barriers, strict=True) if zone is not kept)
 
     def problem_at(self, place: Vec3) -> str:
@@ -177,9 +177,9 @@ class Space:
         return ""
 
     def problem_between(self, start: Vec3, end: Vec3) -> str:
-        """Return what blocks the straight line between two positions, as readable text; empty if nothing is in the way.
+        """Return what blocks the straight line between two positions, as readable text; empty if nothing blocks it.
 
-        A zone that contains the start is ignored, so that a vehicle can leave it.
+        A zone that contains the start is ignored, which lets a vehicle leave it.
         """
         for zone, kept in zip(self.zones, self.barriers, strict=True):
             if not kept.holds(start) and kept.is_in_the_way(start, end):
@@ -202,12 +202,12 @@ def _room(text: str) -> Box | None:
     try:
         zones = parse_zones(text)
     except ParameterError:
-        return None  # a driver uses this name for a different purpose
+        return None  # a driver uses this name for another purpose
     return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
 
 
 def parse_zones(text: str) -> tuple[Zone, ...]:
-    """Parse zones separated by semicolons. Raises :class:`ParameterError` if that fails or there are too many.
+    """Parse zones separated by semicolons. Raises :class:`ParameterError` if they are invalid or there are too many.
 
     A zone is ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, in world axes [m]. It may be
     preceded by a name and a colon: ``tree: cylinder 1 2 0.5 0 3``.
@@ -247,7 +247,7 @@ def _parse_zone(text: str) -> Zone:
 def check_written(name: str, value: Value, number: Callable[[str], float]) -> None:
     """Check a new value for a safety parameter against the others.
 
-    Raises :class:`ParameterError` if the box's opposite walls are the wrong way round or the zones can't be parsed.
+    Raises :class:`ParameterError` if opposite walls of the box are in the wrong order or the zones can't be parsed.
     """
     if name == ZONES:
         parse_zones(str(value))
@@ -279,7 +279,7 @@ def _wrong(why: str) -> ParameterError:
 
 
 def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
-    """Return the part of the segment from ``at`` to ``to`` that is between two walls, within ``first`` to ``last``."""
+    """Return the part of the segment from ``at`` to ``to`` between two walls, limited to ``first`` to ``last``."""
     if at == to:
         return (first, last) if low <= at <= high else (1.0, 0.0)
     one, other = (low - at) / (to - at), (high - at) / (to - at)

@@ -1,4 +1,4 @@
-"""Drones and swarms for ``asyncio``: methods that wait are coroutines, others are plain functions.
+"""Use drones and swarms with ``asyncio``: methods that wait are coroutines, others are plain functions.
 
 ::
 
@@ -7,9 +7,8 @@
         async for frame in drone.frames():
             drone.velocity(forward=0.3)
 
-They wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which run in their own threads and are available as
-:attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the wait, but does not undo the request that it
-was waiting for.
+The classes wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which run in their own threads and are available as
+:attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call stops the wait, but does not undo the pending request.
 """
 
 from skyloop.aio.bridge import Callback, Config, Drone, Listener, Swarm, connect, swarm

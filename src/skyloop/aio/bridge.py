@@ -1,4 +1,4 @@
-"""The asyncio API for drones and swarms: tables of members forwarded to the synchronous classes, and the rest."""
+"""Build the asyncio API for drones and swarms: tables of members forwarded to the synchronous classes, and the rest."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from skyloop.messages import Encoding
 
 T = TypeVar("T")
 Opened = TypeVar("Opened", bound=AbstractAsyncContextManager[Any, Any])
-#: A callback in an asyncio application: a function or a coroutine function. It runs on the event loop.
+#: A callback in an asyncio application: a plain function or a coroutine function. It is run on the event loop.
 Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class LoopNotifier(Notifier):
-    """Wakes, from any thread, the coroutine that waits in :meth:`within`."""
+    """Wakes the coroutine that waits in :meth:`within`, from any thread."""
 
     __slots__ = ("_loop", "_notified")
 
@@ -41,7 +41,7 @@ class LoopNotifier(Notifier):
         self._loop = asyncio.get_running_loop()
 
     def notify(self) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             self._loop.call_soon_threadsafe(self._notified.set)
 
     async def within(self, timeout_s: float) -> bool:
@@ -55,10 +55,10 @@ class LoopNotifier(Notifier):
 
 
 async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
-    """Run a blocking function in its own thread, because a thread pool could be full when the vehicle has to land.
+    """Run a blocking function in its own thread: a thread pool might be full when the vehicle has to land.
 
-    If the caller is cancelled, waiting for a command ends (see :data:`skyloop.client.commands.cancelled`), and
-    ``abandoned`` is called with the unclaimed result.
+    If the caller is cancelled, the function stops waiting for a command (see
+    :data:`skyloop.client.commands.cancelled`), and ``abandoned`` is called with the unclaimed result.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()
@@ -72,7 +72,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
         else:
             future.set_result(result)  # type: ignore[arg-type]
 
-    outside = cancelled.get()  # whether an outer thread waiting for this coroutine has been cancelled
+    outside = cancelled.get()  # whether an outer thread that waits for this coroutine was cancelled
 
     def work() -> None:
         result, error = None, None
@@ -91,14 +91,15 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
     try:
         return await future
     except asyncio.CancelledError:
-        # Cancelled in the iteration of the event loop in which the result arrived, so nothing else receives it.
+        # The call was cancelled in the same iteration of the event loop in which the result arrived: nobody else
+        # receives the result.
         if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
             threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
         raise
 
 
 def from_thread(function: Callback[T]) -> Callable[[T], Any]:
-    """Wrap ``function`` so that another thread can call it and wait while it runs on this event loop."""
+    """Wrap ``function`` for another thread, which can call it and wait while it runs on this event loop."""
     loop = asyncio.get_running_loop()
 
     async def call(sample: T) -> object:
@@ -115,7 +116,7 @@ def from_thread(function: Callback[T]) -> Callable[[T], Any]:
 
 
 def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
-    """Decorate an asyncio class with members of ``kind``; ``rows`` maps each way of making one to their names."""
+    """Decorate an asyncio class with members of ``kind``; ``rows`` maps each way of making a member to the names."""
 
     def fill(face: type[T]) -> type[T]:
         for way, names in rows.items():
@@ -143,7 +144,7 @@ def awaited(member: Any) -> Any:
 
 
 def on_loop(member: Any) -> Any:
-    """Make a method run its callback on the event loop of the caller."""
+    """Make a method run its callback on the caller's event loop."""
     plain = _forwarded(member)
 
     @wraps(plain)
@@ -163,7 +164,7 @@ def on_loop(member: Any) -> Any:
 
 
 def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Callable[..., Opening[Opened]]:
-    """Turn a synchronous connect function into one whose result is awaited or entered as a context manager."""
+    """Turn a synchronous connect function into one whose result can be awaited or used as a context manager."""
 
     @wraps(function)
     def call(*targets: Any, **options: Any) -> Opening[Opened]:
@@ -174,7 +175,7 @@ def opener(face: Callable[[Any], Opened], function: Callable[..., Any]) -> Calla
 
 
 def like(member: Any, text: str = "") -> Callable[[T], T]:
-    """Give a hand-written method the docstring of its counterpart, followed by an extra paragraph."""
+    """Give a hand-written method the docstring of its counterpart, followed by one more paragraph."""
 
     def explain(function: T) -> T:
         function.__doc__ = member.__doc__
@@ -184,7 +185,7 @@ def like(member: Any, text: str = "") -> Callable[[T], T]:
 
 
 def _forwarded(member: Any) -> Callable[..., Any]:
-    """Return a function that calls the method, or reads the property, of the wrapped object."""
+    """Return a function that calls the method or reads the property of the wrapped object."""
     reads = isinstance(member, property)
     function = member.fget if reads else member
 
@@ -209,7 +210,7 @@ def _typed(made: T, signature: inspect.Signature, *, returns: str, **types: str)
     own: Any = made
     own.__signature__ = signature.replace(parameters=parameters, return_annotation=returns)
     own.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": returns}
-    del own.__wrapped__  # otherwise its annotations would take precedence
+    del own.__wrapped__  # because its annotations would take precedence
     return made
 
 
@@ -223,10 +224,10 @@ class Config:
     Writing needs the authority. :class:`skyloop.client.Config` explains how written values are kept.
     """
 
-    sync: client.Config  #: the wrapped parameters
+    sync: client.Config  #: wrapped parameters
 
     def __init__(self, sync: client.Config) -> None:
-        """Wrap parameters of a connected drone."""
+        """Wrap the parameters of a connected drone."""
         self.sync = sync
 
     get = awaited(client.Config.__getitem__)
@@ -235,21 +236,21 @@ class Config:
 
 @mirrors(client.Listener, {at_once: "delivered dropped"})
 class Listener:
-    """A callback that runs on the event loop, one call at a time."""
+    """A callback that runs on the event loop; its calls never overlap."""
 
-    sync: client.Listener[Any]  #: the wrapped listener; its thread waits for each call
+    sync: client.Listener[Any]  #: wrapped listener; its thread waits for each call
 
     def __init__(self, sync: client.Listener[Any]) -> None:
         """Wrap a listener whose function hands samples to the event loop."""
         self.sync = sync
 
     def cancel(self) -> None:
-        """Stop calling the function. Does not wait for a call in progress."""
+        """Stop calling the function. Does not wait for a running call."""
         self.sync.cancel(wait=False)  # its thread may be waiting for this event loop
 
     @property
     def errors(self) -> int:
-        """Number of calls that raised."""
+        """Number of calls that raised an exception."""
         return self.sync.errors
 
 
@@ -271,15 +272,15 @@ class Listener:
     },
 )
 class Drone:
-    """A connected vehicle, made by :func:`connect`.
+    """A connected vehicle, returned by :func:`connect`.
 
-    Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are coroutines.
-    Callbacks, plain or coroutine functions, run on the event loop that was running when they were added. Image
-    callbacks are the exception: they are plain functions in their own threads, because image processing would block the
-    event loop. The predicate of :meth:`wait` is a plain function, too.
+    Methods have the same names, arguments, results and errors as in :class:`skyloop.Drone`; those that wait are
+    coroutines. Callbacks are plain or coroutine functions, and run on the event loop that was running when they were
+    added. Image callbacks are the exception: they are plain functions that run in their own threads, because image
+    processing would block the event loop. The function that :meth:`wait` tests feedback with is a plain function, too.
     """
 
-    sync: client.Drone  #: the wrapped drone
+    sync: client.Drone  #: wrapped drone
     config: Config  #: parameters of the vehicle and of the proxy
 
     def __init__(self, sync: client.Drone) -> None:
@@ -347,14 +348,14 @@ async def _decoded(channel: VideoChannel, arrival: Arrival | None, max_age_s: fl
     },
 )
 class Swarm:
-    """Drones by name, made by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all.
+    """Drones by name, returned by :func:`swarm`; ``drones["alpha"]`` is one :class:`Drone`; iterating yields all.
 
-    Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
-    :meth:`emergency_stop` are coroutines. :meth:`feedback` is a coroutine too, because ``on_error`` may require a
-    landing. Only one task at a time may await them; :meth:`emergency_stop` may be called at any time.
+    Methods have the same names, arguments, results and errors as in :class:`skyloop.Swarm`. All commands except
+    :meth:`emergency_stop` are coroutines. :meth:`feedback` is also a coroutine, because ``on_error`` may require a
+    landing. Only one task at a time may await these coroutines; :meth:`emergency_stop` may be called at any time.
     """
 
-    sync: client.Swarm  #: the wrapped swarm
+    sync: client.Swarm  #: wrapped swarm
 
     def __init__(self, sync: client.Swarm) -> None:
         """Wrap a connected swarm."""
@@ -376,7 +377,7 @@ class Swarm:
         return list(self._drones.items())
 
     def __getitem__(self, name: str) -> Drone:
-        self.sync[name]  # raises for an unknown name
+        self.sync[name]  # raises an error for an unknown name
         return self._drones[name]
 
     def __iter__(self) -> Iterator[Drone]:
@@ -386,9 +387,9 @@ class Swarm:
         return f"<aio.{repr(self.sync)[1:]}"
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` for all active drones concurrently, on this event loop. Cancelling cancels all of them.
+        """Await ``function`` for all active drones concurrently on this event loop. Cancelling it cancels all of them.
 
-        A coroutine function. Exceptions, ``what`` and the result are the same as for :meth:`skyloop.Swarm.each`.
+        A coroutine function. Exceptions, ``what`` and the result work as in :meth:`skyloop.Swarm.each`.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
@@ -407,7 +408,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # otherwise, after a cancellation, they would go on commanding and conflict with the next commands
+        finally:  # after a cancellation, they must not go on commanding and conflict with the next commands
             over = True
             for task in running:
                 task.cancel()
@@ -420,7 +421,7 @@ class Swarm:
 
 
 class Opening(Generic[Opened]):
-    """Result of :func:`connect` and :func:`swarm`: connects when awaited, or for the duration of an ``async with``."""
+    """Result of :func:`connect` and :func:`swarm`; connects when awaited, or for the duration of an ``async with``."""
 
     _opened: Opened | None = None
 
@@ -452,7 +453,7 @@ class Opening(Generic[Opened]):
 
 
 def _reject_in_step(target: object) -> None:
-    """Raise an error for a stepped replay, in which time would never advance here."""
+    """Raise an error for a stepped replay, because its time would never advance in asyncio."""
     if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
         raise UsageError(
             f"{target}: speed=max advances only while a thread waits, which an event loop never does: use "

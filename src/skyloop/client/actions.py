@@ -1,8 +1,8 @@
-"""An application's actions: checks of their numbers, when they are complete and when they are sent. Pure.
+"""Prepare an application's actions: check their numbers, schedule them, and decide when they are complete. Pure.
 
 The newest set-point wins: it is sent at once and then repeated at a steady rate with absolute deadlines, unless a newer
-one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated, which keeps the authority and
-leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
+one follows within one and a quarter periods. Without a set-point, ``Idle`` is repeated. It renews the lease without
+changing what the vehicle does. A set-point from before a lost link, a lost authority or a failsafe is never resent.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.feedback import is_on_earth
 from skyloop.messages.geometry import wrap_angle
 
-AT_REST_M_S: Final = 0.3  #: a vehicle at its target and slower than this has arrived
+AT_REST_M_S: Final = 0.3  #: a vehicle at its target has arrived once it is slower than this
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 _OLD_PLACE_S: Final = 2.0  #: maximum age of feedback used to convert a geographic position
-OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the action may be requested again
-OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: outcomes of actions that the application itself ended
+OVERRULED: Final = (Fate.FAILSAFE, Fate.LINK, Fate.AUTHORITY)  #: not refusals: the application may request it again
+OUTDONE: Final = (Fate.REPLACED, Fate.WITHDRAWN)  #: outcomes of actions that the application ended itself
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
-#: States that complete an action if the proxy reports no outcome; a complete action is no longer sent.
+#: States that complete an action if the proxy reports no outcome. A completed action is no longer sent.
 _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
     Land: frozenset({FlightState.LANDED}),
@@ -64,17 +64,17 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
     Land: nanoseconds(60.0),  # counted from the last time the proxy reports it in progress
-    EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s: a late repeat must not count as another press
+    EmergencyStop: nanoseconds(8.0),  # the driver continues for 10 s; a late repeat must not count as a second press
     ResetEmergency: nanoseconds(2.0),
 }
 _MIN_INTERVAL_NS: Final = nanoseconds(0.005)  #: minimum time between two new set-points, not counting repeats
-_KEEP_NS: Final = nanoseconds(0.5)  #: a set-point that could not be sent is still sent later if it is at most this old
+_KEEP_NS: Final = nanoseconds(0.5)  #: a set-point that could not be sent is sent later unless it is older than this
 _UNSENT_STOP_NS: Final = nanoseconds(2.0)  #: a stop that can't be sent within this time is abandoned
 _STOP_PERIOD_NS: Final = nanoseconds(0.05)  #: interval between repeats of a stop, whatever the rate of other commands
 
 
 def checked(action: AnyAction) -> AnyAction:
-    """Return ``action`` if it can be commanded; raise :class:`UsageError` otherwise."""
+    """Return ``action`` if an application may command it; raise :class:`UsageError` otherwise."""
     if type(action) not in _ACTIONS:
         raise UsageError(f"a command must be one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
     try:
@@ -108,7 +108,7 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
 
 
 def return_action(height_m: object, land: object) -> ReturnToStart:
-    """Return the action that flies back to the start; the proxy's parameters replace values of None.
+    """Return the action that flies back to the start; for values that are None, the proxy uses its parameters.
 
     Raises :class:`UsageError` if a value is not a number or bool, or makes no sense.
     """
@@ -122,11 +122,11 @@ def return_action(height_m: object, land: object) -> ReturnToStart:
 def in_world_axes(
     local: tuple[object, object, object], earth: tuple[object, object, object], newest: Feedback | None, age_s: float
 ) -> tuple[object, object, object]:
-    """Return x, y, z [m] of a target given in one of two ways; the values of the other are None.
+    """Return x, y, z [m] of a target given as either ``local`` or ``earth``; the other argument contains only None.
 
-    ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m],
-    None for the current height. Raises :class:`UsageError` if both forms or neither are given, or a value is not a
-    number or not on the earth, and :class:`RefusedError` if the vehicle's geographic position is unknown.
+    ``local``: x, y, z in world axes [m]. ``earth``: latitude and longitude [°], and altitude above mean sea level [m];
+    an altitude of None means the current height. Raises :class:`UsageError` if both forms or neither are given, or if a
+    value is invalid. Raises :class:`RefusedError` if the vehicle's geographic position is unknown.
     """
     if all(one is None for one in earth):
         if any(one is None for one in local):
@@ -194,7 +194,7 @@ class ReturnWatch:
         self._began = False
 
     def __call__(self, feedback: Feedback) -> bool:
-        """Return whether the vehicle has been returning and has since landed, or hovers above its start."""
+        """Return whether the vehicle has started returning and has since landed or is hovering above its start."""
         phase = feedback.return_phase
         self._began |= phase is not ReturnPhase.NONE
         return self._began and (phase is ReturnPhase.ARRIVED or feedback.state is FlightState.LANDED)
@@ -210,13 +210,13 @@ class Unsent(NamedTuple):
 
 
 class CommandSchedule:
-    """Stores the newest set-point of one application. Times are on this process's clock."""
+    """Stores the newest set-point of an application and decides when to send it. Times are on this process's clock."""
 
     def __init__(self, *, rate_hz: float = 32.0, stall_s: float = 1.0) -> None:
         """Start without a set-point; repeat later ones at 1 to 200 Hz. Raises :class:`UsageError` for invalid values.
 
-        After ``stall_s`` without a call, a velocity or attitude decays to hover; ``math.inf``: never. Flights to a
-        target and return flights do not decay: the vehicle stops there.
+        If the application makes no call for ``stall_s``, a velocity or attitude decays to hover; ``math.inf`` disables
+        this. Flights to a target and return flights do not decay: the vehicle stops there.
         """
         if not 1.0 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
@@ -231,19 +231,19 @@ class CommandSchedule:
         self.owed: Unsent | None = None  #: a one-off request that could not be sent yet
         self.latest: dict[type[AnyAction], int] = {}  #: number of the newest intent of each kind
         self._asked_ns = 0
-        # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
-        # period longer, and only the application's commands delay the next one.
+        # Repeats must not delay an application that commands at about the same rate. Therefore the first repeat waits a
+        # quarter period longer, and only the application's own commands delay the next command.
         self._first_ns = self._period_ns * 5 // 4
         self._new_sent_ns = -_MIN_INTERVAL_NS  # time at which the newest intent was first sent
         self._sent_intent = 0
         self.due_ns = 0  #: time at which :meth:`next` will have something to send
         self._failsafe = Failsafe.NONE
-        self._reset_asked_ns: int | None = None  # when a reset was requested while a stop was active
+        self._reset_asked_ns: int | None = None  # time of a reset requested while a stop was active
 
     def ask(self, action: AnyAction, now_ns: int, *, automatic: bool = False) -> int:
-        """Make ``action``, already allowed by :meth:`may_ask`, the set-point; return the number of this intent.
+        """Make ``action`` the set-point and return the number of this intent; :meth:`may_ask` must have allowed it.
 
-        ``automatic``: whether the library, rather than the application, requests it.
+        ``automatic``: whether the library, rather than the application, requests the action.
         """
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
@@ -263,15 +263,15 @@ class CommandSchedule:
 
     @property
     def stopping(self) -> bool:
-        """Whether an emergency stop is in progress, which only another stop may replace; see :meth:`may_ask`."""
+        """Whether an emergency stop is in progress; only another stop may replace it (see :meth:`may_ask`)."""
         return isinstance(self.action, EmergencyStop)
 
     def may_ask(self, action: AnyAction) -> bool:
         """Return whether the application may command this now.
 
-        An emergency stop is repeated until the vehicle reports it, or for 8 s. Until then, this application sends
-        nothing else; otherwise a single lost packet would end the stop while sticks are held. ``Idle`` withdraws a stop
-        that was never sent. A reset is sent once the vehicle has reported the stop, provided that it reports it soon.
+        An emergency stop is repeated until the vehicle confirms it, or for 8 s. Until then, this application sends
+        nothing else; otherwise, after a single lost packet, held sticks would end the stop. ``Idle`` withdraws a stop
+        that was never sent. A reset is sent once the vehicle has reported the stop, unless the report takes too long.
         """
         if type(self.action) is not EmergencyStop or isinstance(action, EmergencyStop | ResetEmergency):
             return True
@@ -279,7 +279,7 @@ class CommandSchedule:
 
     @property
     def open_ns(self) -> int:
-        """When a new set-point may next be sent without delay [ns]."""
+        """Earliest time at which a new set-point can be sent without delay [ns]."""
         return self._new_sent_ns + _MIN_INTERVAL_NS
 
     def next(self, now_ns: int) -> AnyAction | None:
@@ -299,25 +299,25 @@ class CommandSchedule:
             self._sent_intent, self._new_sent_ns = self.intent, now_ns
             self.due_ns = now_ns + first_ns
             return self.action
-        # The next deadline follows from the last one rather than from now, so that the rate is kept; a deadline missed
-        # by more than a period is skipped.
+        # The next deadline follows from the last one rather than from now, which keeps the rate steady. A deadline
+        # missed by more than a period is skipped.
         self.due_ns += period_ns
         if self.due_ns <= now_ns:
             self.due_ns = now_ns + period_ns
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Record that the action from :meth:`next` was not sent. A new set-point replaces it unless it is a landing."""
+        """Record that the action from :meth:`next` was not sent. A new set-point replaces it, except a landing."""
         if isinstance(action, EmergencyStop):
-            if self._new_sent_ns == now_ns:  # first attempt: it may still be withdrawn, and is abandoned soon
+            if self._new_sent_ns == now_ns:  # first attempt: the action may still be withdrawn, and is soon abandoned
                 self._sent_intent = -1
         elif not _is_periodic(action):
             self.owed = Unsent(action, self.intent, now_ns, self.automatic)
 
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
-        """Return :attr:`owed` if it must be sent first because ``action`` neither repeats nor revokes it.
+        """Return :attr:`owed` if it must be sent before ``action``, because ``action`` neither repeats nor revokes it.
 
-        Actions by the library itself revoke everything except a landing.
+        Actions requested by the library itself revoke everything except a landing.
         """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > _KEEP_NS:
@@ -327,18 +327,18 @@ class CommandSchedule:
         return owed if _is_periodic(action) else None
 
     def decayed(self, before: AnyAction) -> bool:
-        """Return whether the set-point ``before`` has decayed to hover for lack of calls by the application."""
+        """Return whether the set-point ``before`` has decayed to hover because the application made no calls."""
         return self.action is _HOVER and before is not _HOVER
 
     def observe(self, feedback: Feedback, now_ns: int, app_id: int = 0) -> None:
-        """End the set-point if the proxy reports that its intent has ended, or if a failsafe has overruled it."""
+        """End the set-point if the proxy reports that its intent has ended, or that a failsafe has overruled it."""
         kind, outcome = type(self.action), feedback.outcome
         done_in = _DONE_IN.get(kind)
         if outcome is not None and (outcome.app_id, outcome.intent) == (app_id, self.intent):
             if outcome.over:
                 self._end(outcome)
             elif kind is Land and feedback.state is not FlightState.UNKNOWN:
-                self._asked_ns = now_ns  # the proxy continues the landing, however long it takes
+                self._asked_ns = now_ns  # the proxy continues the landing for as long as it takes
         if done_in is None:
             if feedback.state is FlightState.EMERGENCY:
                 self.clear(Fate.EMERGENCY)
@@ -367,8 +367,8 @@ class CommandSchedule:
             self.action = _IDLE
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
-        """Resume sending on the connection made at ``connected_ns``, without a set-point that is too old."""
-        if now_ns - self._asked_ns > _KEEP_NS:  # the connection has stayed the same, and only the lease was missing
+        """Resume sending on the connection made at ``connected_ns``, but drop a set-point that is too old."""
+        if now_ns - self._asked_ns > _KEEP_NS:  # the connection is still the same; only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

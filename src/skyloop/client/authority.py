@@ -1,6 +1,6 @@
 """Track this application's authority from replies, events and feedback, and answer requests to hand it over.
 
-Pure. Replies and events can be lost, and feedback can be older than a grant. Lease numbers grow with each grant.
+Pure. Replies and events can be lost, and feedback can predate the newest grant. Lease numbers grow with each grant.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ TakeoverWay = Literal["now", "ask"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Authority:
-    """An application's request for the authority over a drone: ``connect("alpha", authority=Authority(priority=4))``.
+    """An application's request for authority over a drone: ``connect("alpha", authority=Authority(priority=4))``.
 
     Attributes:
         priority: 0 (highest) to 31 (lowest); a higher priority pre-empts a lower one.
         wait_s: How long to wait in the queue while another application holds the authority [s].
         for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
-        takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
-        stay: Whether to stay in the queue after ``wait_s``, without the authority, rather than fail.
+        takeover: ``"now"`` pre-empts a holder of lower priority immediately; ``"ask"`` asks the holder first.
+        stay: Whether to remain in the queue after ``wait_s`` instead of raising an error.
 
     Raises:
         UsageError: If a value is out of range.
@@ -73,14 +73,14 @@ class AuthorityStatus:
     priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
     holder: str | None = None  #: name of the application that holds it; None: none, or unknown
     position: int = 0  #: position in the queue, 1 being next; 0 if unknown
-    expected_wait_s: float | None = None  #: if all requests ahead keep to their announced times [s]; None if unknown
-    until_ns: int | None = None  #: when the requested time ends, on the proxy's clock; None: unlimited
+    expected_wait_s: float | None = None  #: waiting time if all requests ahead end at their announced times [s]
+    until_ns: int | None = None  #: end of the requested time, on the proxy's clock; None: unlimited
 
 
 class EndedSessions:
-    """This process's finished sessions, by run of the proxy and number of the application. Thread-safe.
+    """This process's finished sessions, identified by the proxy's run and the application's number. Thread-safe.
 
-    A proxy may not notice that a session has ended before the next one begins; until then, it still has the authority.
+    A proxy may notice a session's end only after the next one has begun; until then, the old one holds the authority.
     """
 
     MOST = 256  #: maximum number of sessions remembered
@@ -155,7 +155,7 @@ class AuthorityTracker:
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """Handle a lost connection, which ends the authority; if it is to be renewed, it is still wanted."""
+        """Handle a lost connection, which ends the authority; the application still wants it if it is to be renewed."""
         if self.app_id:
             self._ended.add(self._run_id, self.app_id)
         self.pending = False
@@ -212,13 +212,13 @@ class AuthorityTracker:
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # the lease has run out, so it is not requested again automatically
+            if data.get("reason") == "expired":  # the lease has expired, and is not requested again automatically
                 return self.given_back()
             return self._lost(None)
         return False
 
     def feedback(self, feedback: Feedback, now_ns: int) -> bool:
-        """Update the authority from the owner and the lease in feedback, in case events were lost."""
+        """Update the authority from the owner and the lease given in feedback, in case events were lost."""
         before_id, self._owner_id = self._owner_id, feedback.owner_id
         if feedback.owner_id == self.app_id and feedback.lease:
             return (
@@ -230,7 +230,7 @@ class AuthorityTracker:
             newer = feedback.lease > self.status.lease
             until_ns = self.status.until_ns
             if newer and until_ns is not None and feedback.captured_ns >= until_ns:
-                return self.given_back()  # its time has run out, and the event was lost or is late
+                return self.given_back()  # its time has expired, and the event was lost or is late
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted"):
@@ -263,13 +263,13 @@ class TakeoverRequest:
 
     by: str  #: name of the other application
     priority: int  #: 0 is the highest
-    within_s: float  #: after this time [s], it wins if its priority is strictly higher
+    within_s: float  #: time after which the other application takes over if its priority is strictly higher [s]
     for_s: float | None  #: how long the application wants to hold the authority [s]; None: unlimited
 
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuery:
-    """A request as it was received, with the data needed to answer it."""
+    """A request for the authority, with the data needed to answer it."""
 
     request: TakeoverRequest
     lease: int  #: the lease to give up
@@ -277,7 +277,7 @@ class TakeoverQuery:
 
 
 def authority_request(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
-    """Return the request for the authority; arguments and errors are those of :class:`Authority`."""
+    """Return a request for the authority; arguments and errors are those of :class:`Authority`."""
     if not isinstance(priority, int) or not HIGHEST_PRIORITY <= priority <= LOWEST_PRIORITY:
         raise UsageError(f"priority is {priority!r} and must be a whole number from 0 (highest) to 31 (lowest)")
     if takeover not in ("now", "ask"):
@@ -292,7 +292,7 @@ def answering(
     app_id: Callable[[], int],
     answer: Callable[[int, int, bool, str], None],
 ) -> Callable[[Event], None]:
-    """Return a callback for events that calls ``function`` when another application requests this one's authority.
+    """Return an event callback that calls ``function`` when another application requests this one's authority.
 
     ``answer`` is called with the lease, the requesting application's number, the decision and the reason. Raises
     :class:`UsageError` if ``function`` can't be called.
@@ -312,7 +312,7 @@ def answering(
 
 
 def takeover_query(event: Event, app_id: int) -> TakeoverQuery | None:
-    """Return an event's request to the application ``app_id``; None if it has none."""
+    """Return the request that an event contains for the application ``app_id``; None if it contains none."""
     data = event.data
     if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != app_id:
         return None

@@ -43,10 +43,9 @@ class Channel(Generic[T]):
     def __init__(self, subscribe: Callable[[bool], None] | None = None) -> None:
         """Create a channel without consumers.
 
-        ``subscribe`` is called with True when samples begin to be needed and with False when they no longer are, while
-        the channel's lock is held.
+        ``subscribe`` is called under the lock: with True when samples are needed, with False when they no longer are.
         """
-        self.subscribed = False  #: whether samples are needed, because there is a consumer or the channel is kept
+        self.subscribed = False  #: whether samples are needed: there is a consumer or the channel is kept
         self.kept = False  #: subscribed permanently, by :meth:`keep`
         self._consumers: tuple[Callable[[T], None], ...] = ()
         self._drops: dict[Callable[[T], None], Callable[[], int]] = {}
@@ -55,14 +54,14 @@ class Channel(Generic[T]):
         self._subscribe = subscribe
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Add a consumer, to be called on the publishing thread; ``dropped`` returns how many samples it has missed."""
+        """Add a consumer, called on the publishing thread; ``dropped`` returns how many samples it has missed."""
         with self._lock:
             self._drops[consumer] = dropped
             self._consumers = (*self._consumers, consumer)
             self._update()
 
     def remove(self, consumer: Callable[[T], None]) -> None:
-        """Remove a consumer. Does nothing if it is unknown."""
+        """Remove a consumer. An unknown consumer is ignored."""
         with self._lock:
             if consumer not in self._drops:
                 return
@@ -94,17 +93,17 @@ class Channel(Generic[T]):
 
     @property
     def dropped(self) -> int:
-        """Number of samples that consumers missed, including consumers since removed."""
+        """Number of samples that consumers have missed, including consumers that were removed."""
         with self._lock:
             return self._dropped_before + sum(dropped() for dropped in self._drops.values())
 
     def publish(self, sample: T) -> None:
-        """Deliver ``sample`` to every consumer on this thread. No lock is held during the calls."""
+        """Deliver ``sample`` to every consumer on the calling thread. No lock is held during the calls."""
         for consumer in self._consumers:
             consumer(sample)
 
     def _update(self) -> None:
-        """Subscribe or unsubscribe if the need has changed. The lock is held."""
+        """Subscribe or unsubscribe if samples are newly needed or no longer needed. The caller must hold the lock."""
         wanted = self.kept or bool(self._consumers)
         if wanted is not self.subscribed:
             self.subscribed = wanted
@@ -113,13 +112,13 @@ class Channel(Generic[T]):
 
 
 class FollowingChannel(Channel[T], Generic[T, C]):
-    """A channel that switches to another camera's channel if the proxy restarts with other cameras.
+    """A channel that switches to another camera's channel if the proxy restarts with different cameras.
 
-    Used by callers that don't name a camera, to get the vehicle's first. Consumers are added to the current channel.
+    Callers that don't name a camera use it to get the vehicle's first. New consumers are added to the current channel.
     """
 
     def __init__(self, find: Callable[[], C], changes: Channel[Any]) -> None:
-        """Start with the result of ``find``, called again after each sample of ``changes``, then ignoring errors."""
+        """Start with the result of ``find``, called again after each sample of ``changes``; ignore its later errors."""
         super().__init__()
         self.current = find()
         self._find = find
@@ -143,7 +142,7 @@ class FollowingChannel(Channel[T], Generic[T, C]):
                     self._changes.remove(self._looks)
 
     def _find_again(self, _: object) -> None:
-        with self._lock, suppress(SkyloopError):  # there is no camera, or the drone was closed
+        with self._lock, suppress(SkyloopError):  # the vehicle has no camera, or the drone was closed
             before, self.current = self.current, self._find()
             for consumer, dropped in self._drops.items() if self.current is not before else ():
                 before.remove(consumer)
@@ -155,12 +154,12 @@ def _since(dropped: Callable[[], int], before: int) -> int:
 
 
 class Listener(Generic[T]):
-    """An application's callback, which is called with samples until :meth:`cancel` or the end of its block.
+    """An application's callback, called with samples until :meth:`cancel` or the end of its ``with`` block.
 
-    The function has its own thread and a mailbox of the newest ``depth`` samples: however slow it is, it gets new
-    samples and delays no other consumer. With ``inline=True`` it is called on the receiving thread, before the next
-    sample is received, which is fastest; it must be quick and must not wait. Its exceptions are counted and, at most
-    once a second, logged and emitted as an event; the function is called again with the next sample.
+    The function has its own thread and a mailbox of the newest ``depth`` samples. However slow it is, it receives new
+    samples and delays no other consumer. With ``inline=True``, the function is called on the receiving thread before
+    the next sample is received. This is fastest, but the function must be quick and must not wait. Its exceptions are
+    counted, and at most one per second is logged and emitted as an event. The next sample is delivered as usual.
     """
 
     def __init__(
@@ -176,9 +175,9 @@ class Listener(Generic[T]):
     ) -> None:
         """Start calling ``function`` with each sample of ``channel``; up to ``depth`` samples may wait.
 
-        ``report`` is called with this listener's ``name``, which is also the name of its thread, and each exception of
-        ``function``; ``on_cancel`` is called with this listener. ``inline``: call the function on the publishing thread
-        instead of on its own.
+        ``report`` is called with the listener's ``name`` and each exception of ``function``; the listener's thread has
+        the same name. ``on_cancel`` is called with the listener. ``inline``: whether to call the function on the
+        publishing thread instead of on a thread of its own.
         """
         self.name = name
         self.errors = 0  #: number of calls that raised
@@ -197,12 +196,12 @@ class Listener(Generic[T]):
 
     @property
     def delivered(self) -> int:
-        """Number of calls of the function."""
+        """Number of times the function has been called."""
         return self._calls
 
     @property
     def dropped(self) -> int:
-        """Samples replaced by newer ones before the function was ready for them."""
+        """Number of samples replaced by newer ones before the function was ready for them."""
         return self._mailbox.dropped
 
     def cancel(self, *, wait: bool = True) -> None:
@@ -241,9 +240,9 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
-        except ClosedError:  # the drone was closed or its flight ended, which is not an error of the function
+        except ClosedError:  # the drone was closed or its flight ended; this is not an error of the function
             self.errors += 1
-        except SystemExit as error:  # otherwise it would only end this thread, unnoticed
+        except SystemExit as error:  # without this, it would only end this thread, and nobody would notice
             self._report(self.name, error)
         except Exception as error:  # noqa: BLE001  (an application's function may raise anything)
             self.errors += 1
@@ -259,26 +258,26 @@ class Listener(Generic[T]):
 
 
 class Holder(Protocol[T_contra]):
-    """A destination for samples: a mailbox, or several that are emptied together."""
+    """A destination for samples: one mailbox, or several that a consumer empties together."""
 
     def put(self, item: T_contra, /) -> None:
         """Add the newest item and wake the consumer."""
 
     @property
     def dropped(self) -> int:
-        """Items replaced by newer ones before they were taken."""
+        """Number of items replaced by newer ones before a consumer took them."""
 
 
 class Mailbox(Generic[T]):
-    """Keeps the newest ``depth`` items until its consumer takes them, and counts the dropped ones.
+    """Keeps the newest ``depth`` items until its consumer takes them, and counts the items it dropped.
 
-    Any number of threads may put items; only one takes them.
+    Any number of threads may put items, but only one may take them.
     """
 
     __slots__ = ("_items", "_lock", "_offered", "closed", "delivered", "depth", "notifier")
 
     def __init__(self, depth: int = 1, notifier: Notifier | None = None) -> None:
-        """Create an empty mailbox; with a shared ``notifier``, a thread can wait for several."""
+        """Create an empty mailbox; mailboxes that share a ``notifier`` let one thread wait for all of them."""
         self.depth = depth
         self.notifier = notifier or Notifier()
         self.closed = False
@@ -319,12 +318,12 @@ class Mailbox(Generic[T]):
             return self._items[0] if self._items else None
 
     def wait(self, timeout_s: float | None = None) -> T | None:
-        """Wait for an item (without limit for None) and take it; return None after the time-out, or once closed."""
+        """Wait for an item and take it; return None after the time-out or once the mailbox is closed."""
         self.notifier.wait_for(lambda: bool(self._items) or self.closed, timeout_s)
         return None if self.closed else self.take()
 
     def close(self) -> None:
-        """Discard all items and wake the consumer, which then receives None."""
+        """Discard all items and wake the consumer, which receives None."""
         self.closed = True
         with self._lock:
             self._offered -= len(self._items)  # discarded items are counted neither as delivered nor as dropped
@@ -333,9 +332,9 @@ class Mailbox(Generic[T]):
 
 
 class Notifier:
-    """Wakes all threads that wait for a condition. Notifying costs a single test when no thread waits.
+    """Wakes all threads that wait for a condition. Notifying is a single check when no thread waits.
 
-    Each waiting thread adds its own lock and then checks its condition again. In this way, no notification is missed,
+    Each waiting thread adds its own lock and then checks its condition once more. This way no notification is missed,
     and the notifying thread, which receives for all consumers, never acquires a lock.
     """
 
@@ -355,9 +354,9 @@ class Notifier:
             lock.release()
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true (without limit for None); return whether it became true in time.
+        """Wait until ``ready()`` is true; return whether it became true in time. None waits without limit.
 
-        ``ready`` is called on this thread, at once and then after each notification.
+        ``ready`` is called on the waiting thread, once immediately and then after each notification.
         """
         if ready():
             return True

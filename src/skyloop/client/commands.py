@@ -1,4 +1,4 @@
-"""One application's authority and commands, over any connection."""
+"""Manage one application's authority and commands over any connection."""
 
 from __future__ import annotations
 
@@ -47,31 +47,30 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, SET_POINTS
 from skyloop.messages.config import MAX_REASON
 
-ANSWER_S: Final = 2.0  #: time limit for the proxy's answer to a request for the authority
-#: Time for the proxy to notice that an earlier session of this process has ended, which exceeds the time-out of that
-#: session's lease.
+ANSWER_S: Final = 2.0  #: time limit for the proxy's reply to an authority request
+#: Time for the proxy to notice the end of an earlier session of this process; exceeds the time-out of its lease.
 OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
-#: An application's requests that an automatic hover by the library must not end.
+#: Requests by an application that the library's automatic hover must not end.
 LANDING: Final = (Land, EmergencyStop)
-_LATER_ACTIONS: Final = (Position, ReturnToStart)  #: unknown to older proxies
+_LATER_ACTIONS: Final = (Position, ReturnToStart)  #: older proxies don't know these actions
 _REFUSING: Final = (Fate.REFUSED, Fate.OTHERS)  #: outcomes after which the next set-point is most likely refused, too
-#: Actions that programs send continuously; failing to send one of them is not an error.
+#: Actions that programs send continuously. Failing to send one of these actions is not an error.
 _STREAMED: Final = (Idle, Hover, Velocity, Attitude)
 
-_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: not sent once the caller has stopped waiting
-#: Whether the caller of the current thread or task has stopped waiting; set for threads that wait on another's behalf.
+_FLYING: Final = (Takeoff, ResetEmergency, *SET_POINTS)  #: actions not sent once the caller has stopped waiting
+#: Whether the caller in the current thread or task has stopped waiting; set for threads that wait on behalf of another.
 cancelled: Final[ContextVar[Callable[[], bool]]] = ContextVar("cancelled", default=lambda: False)
 
 
 class GivenUpError(Exception):
-    """Raised when the caller has stopped waiting; caught within the library."""
+    """Raised when the caller has stopped waiting; the library catches this exception itself."""
 
 
 class CommandSender:
-    """Requests and keeps the authority, and sends the newest command at once and then at a steady rate.
+    """Requests and renews the authority; sends the newest command immediately and then at a steady rate.
 
-    No other object changes its ``authority``.
+    Only this object changes its ``authority``.
     """
 
     def __init__(
@@ -88,8 +87,8 @@ class CommandSender:
     ) -> None:
         """Prepare for sending; nothing is sent before :meth:`connected` is called.
 
-        ``emit`` gets the events created here. ``changed`` is called when the status of the authority has changed, and
-        ``granted`` with the number of each new lease, on the thread that noticed.
+        ``emit`` receives the events created here. ``changed`` is called when the status of the authority has changed,
+        and ``granted`` is called with the number of each new lease. Both run on the thread that noticed.
         """
         self.role = role
         self._authority = authority
@@ -99,18 +98,18 @@ class CommandSender:
         self._emit = emit
         self._changed = changed
         self._granted = granted
-        self._lock = threading.Lock()  # guards everything below; never held during a wait or a callback
+        self._lock = threading.Lock()  # guards everything below; never held while waiting or calling a callback
         self._seq = 0
         self._connected_ns = 0  # when the current connection was made
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
-        self.barred = False  #: whether the flight is ending; only the library's own commands and stops are sent
-        self._impossible: dict[type, str] = {}  # by type: why neither vehicle nor proxy supports it
+        self.barred = False  #: whether the flight is ending: only stops and the library's own commands are sent
+        self._impossible: dict[type, str] = {}  # by type of action: why neither the vehicle nor the proxy supports it
         self.told: Outcome | None = None  #: the proxy's newest report on this application's intents
-        self._first_set_point = 0  # number of the first intent in the current series of set-points; 0: there is none
+        self._first_set_point = 0  # number of the first intent in this series of set-points; 0: none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
-        self.sends = ChannelCounter()  #: counts commands sent; ``dropped``: those that were not handed to the transport
+        self.sends = ChannelCounter()  #: counts commands sent, and those not handed to the transport as ``dropped``
 
     @property
     def status(self) -> AuthorityStatus:
@@ -119,7 +118,7 @@ class CommandSender:
 
     @property
     def app_id(self) -> int:
-        """Number of this application in this run of the proxy."""
+        """Number of this application in this run of its proxy."""
         return self._authority.app_id
 
     @property
@@ -128,12 +127,12 @@ class CommandSender:
         return self.schedule.intent
 
     def latest(self, *kinds: type[AnyAction]) -> int:
-        """Return the number of the newest intent of these kinds; 0 if there was none."""
+        """Return the number of the newest intent of the given kinds; 0 if there was none."""
         return max(self.schedule.latest.get(kind, 0) for kind in kinds)
 
     @property
     def newest(self) -> AnyAction:
-        """The action being repeated; idle if there is none."""
+        """The action being repeated; ``Idle`` if there is none."""
         return self.schedule.action
 
     @property
@@ -142,25 +141,25 @@ class CommandSender:
         return self.schedule.wants_flight
 
     def bar(self) -> None:
-        """Bar the application's commands except an emergency stop; once this returns, none is still being sent."""
+        """Bar the application's commands except emergency stops; when this returns, none is still being sent."""
         with self._lock:
             self.barred = True
 
     def flown_by_person(self) -> None:
-        """Require a person's presence from now on; see :meth:`present_until`.
+        """From now on, require a person to be present; see :meth:`present_until`.
 
-        If the connection or the lease is lost, only that person can request the authority again; nothing is automatic.
+        If the connection or lease is lost, only that person can request the authority again, never the library.
         """
         with self._lock:
             self._authority.renews = False
             self._present_until_ns = self._clock()
 
     def present_until(self, until_ns: int) -> None:
-        """Extend the time until which the person flying is known to be present; never shortens it.
+        """Extend the time until which the person flying is known to be present; an earlier time is ignored.
 
-        After that time, nothing is repeated, no new flight is started and the authority is not requested, so that the
-        proxy considers the pilot absent. Commands that end a flight are still sent once, and emergency stops always.
-        The sending thread checks this itself, however busy other threads are.
+        After that time, nothing is repeated, no new flight is started and the authority is not requested. The proxy
+        then considers the pilot absent. Commands that end a flight are still sent once, and emergency stops are always
+        sent. The sending thread checks the time itself, so a delay in other threads does not matter.
         """
         with self._lock:
             known_ns = self._present_until_ns
@@ -168,8 +167,8 @@ class CommandSender:
                 return
             absent, schedule = known_ns < self._clock(), self.schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
-            ends = kind is Land or (kind is Hover and not schedule.automatic)  # a person may be waiting for it
-            if absent and not ends:  # an old set-point must not come back into force when the person returns
+            ends = kind is Land or (kind is Hover and not schedule.automatic)  # a person may be waiting for this
+            if absent and not ends:  # an old set-point must not take effect again when the person returns
                 schedule.clear(Fate.WITHDRAWN)
                 if kind in (Velocity, Attitude):
                     schedule.ask(Hover(), self._clock(), automatic=True)
@@ -185,20 +184,21 @@ class CommandSender:
     def command(self, action: AnyAction, *, now: bool = False, automatic: bool = False) -> bool:
         """Make ``action``, whose numbers have been checked, the newest set-point; see :class:`skyloop.Drone`.
 
-        With ``now``, raise if it can't be sent at once; in that case only a landing is still sent later. ``automatic``:
-        the library itself requests it, so it never takes a vehicle from others, and :meth:`bar` does not stop it.
+        With ``now``, raise an error if the command can't be sent immediately; in that case, only a landing is still
+        sent later. ``automatic``: whether the library itself requests it; it then takes no vehicle from others and
+        ignores :meth:`bar`.
 
         Raises:
             ClosedError: If the drone is closed, or after :meth:`bar`.
-            UnsupportedError: If neither the vehicle nor its proxy supports it.
-            AuthorityError: If another application holds the authority, none was requested, or this one only observes;
-                with ``now``, also if the request for the authority has not been answered yet.
+            UnsupportedError: If neither the vehicle nor its proxy supports the action.
+            AuthorityError: If another application holds the authority, none was requested, or this application is only
+                an observer; with ``now``, also if the request for the authority has not been answered yet.
             RefusedError: If an emergency stop blocks a one-off action, or any action with ``now``.
             LinkError: If the link is down and ``now`` is True.
         """
         intent, sent = self._put(action, now=now, automatic=automatic)
         if not isinstance(action, SET_POINTS):
-            # After any other command, a new series of set-points begins, to which an earlier refusal does not apply.
+            # After any other command, a new series of set-points begins, and an earlier refusal no longer applies.
             self._first_set_point = 0
             return sent
         told = self.told
@@ -208,18 +208,18 @@ class CommandSender:
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
         """Make ``action`` the newest set-point like :meth:`command`, and return the number of the intent.
 
-        :meth:`outcome` returns its outcome. ``again`` is the intent that it repeats under a new number; if another
-        command has been given since, nothing is sent and the number stays the same.
+        :meth:`outcome` returns its outcome. ``again`` is the intent that this call repeats under a new number. If
+        another command has been given since, nothing is sent and the number stays the same.
         """
         return self._put(action, automatic=automatic, again=again)[0]
 
     def _put(
         self, action: AnyAction, *, now: bool = False, automatic: bool = False, again: int | None = None
     ) -> tuple[int, bool]:
-        """Make ``action`` the newest set-point and send it if possible; return the intent and whether it was sent.
+        """Make ``action`` the newest set-point and send it if possible; return its intent and whether it was sent.
 
-        Nothing can be sent while the link is down, the authority or the effect of an emergency stop is awaited, or the
-        person flying is absent. Raises :class:`GivenUpError` if the caller was :data:`cancelled`.
+        Nothing can be sent while the link is down, the person flying is absent, or the authority or the effect of an
+        emergency stop is awaited. Raises :class:`GivenUpError` if the caller has stopped waiting (:data:`cancelled`).
         """
         connection, schedule, authority = self._connection, self.schedule, self._authority
         if connection.why_closed:
@@ -229,12 +229,12 @@ class CommandSender:
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
         with self._lock:
-            # Nothing changes before schedule.ask(): calls that raise or return earlier leave the set-point unchanged.
-            wanted = not automatic or type(action) is Takeoff  # the caller is still waiting for a repeated take-off
+            # Nothing changes before schedule.ask(): a call that raises or returns earlier has no effect.
+            wanted = not automatic or type(action) is Takeoff  # the caller is still waiting for the take-off
             if self.barred and wanted and not stop:
                 raise ClosedError(f"{action.name} comes too late: the end of this flight has begun")
             if wanted and isinstance(action, _FLYING) and cancelled.get()():
-                raise GivenUpError  # nothing was sent, so newer commands stay in force
+                raise GivenUpError  # nothing was sent, and newer commands stay in force
             if again is not None and again != schedule.intent:
                 return again, False
             # A hover requested by the library must not end the application's landing or stop.
@@ -251,21 +251,21 @@ class CommandSender:
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
-            # From here on, the set-point is stored: if it can't be sent now, tick() may still send it within 0.5 s.
+            # From here on, the set-point is stored: if it can't be sent now, tick() can still send it within 0.5 s.
             absent = self._present_until_ns is not None and now_ns > self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
-                    if type(action) is not Land:  # if this raises, the command must not be executed later
+                    if type(action) is not Land:  # after an error, the command must not be executed later
                         schedule.clear(Fate.WITHDRAWN)
                     raise self._not_now(action)
                 return intent, False
             if schedule.due_ns <= now_ns:
                 return intent, self._send_next(now_ns)
-        connection.poke()  # it is too soon after the last command, so the supervisor's thread sends this one
+        connection.poke()  # the last command was too recent; the supervisor's thread sends this one
         return intent, True
 
     def outcome(self, intent: int) -> Outcome | None:
-        """Return the outcome of an intent that has ended; None while it appears to be in progress."""
+        """Return the outcome of an intent; None while the intent appears to be in progress."""
         with self._lock:
             if intent != self.schedule.intent:
                 return Outcome(self.app_id, intent, Fate.REPLACED, Refusal.NOT_FRESH, ENDINGS[Fate.REPLACED])
@@ -273,11 +273,11 @@ class CommandSender:
 
     @property
     def may_ask(self) -> bool:
-        """Whether commands can be sent now: there is a connection, and this application holds the authority on it."""
+        """Whether commands can be sent now: a connection exists, and this application holds the authority on it."""
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
-        """Clear the set-point so that it is not sent later."""
+        """Clear the set-point to prevent it from being sent later."""
         with self._lock:
             self.schedule.clear(Fate.WITHDRAWN)
 
@@ -285,8 +285,8 @@ class CommandSender:
         """Request the authority and wait for it; see :meth:`skyloop.Drone.request_authority`.
 
         Raises:
-            AuthorityError: If it is refused or not granted within ``wait_s``, or this application only observes.
-            NoAnswerError: If the proxy does not answer the request, or the link is lost and does not return in time.
+            AuthorityError: If the authority is refused or not granted in time, or if this application is an observer.
+            NoAnswerError: If the proxy does not answer the request, or if the link is lost and not restored in time.
             ClosedError: If the drone is closed during the wait.
         """
         if self.role is Role.OBSERVER:
@@ -320,10 +320,10 @@ class CommandSender:
         return self.notifier.wait_for(lambda: self._connection.why_closed != "" or ready(), timeout_s)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str, *, wait: bool = False) -> None:
-        """Answer an application that requests the authority; an answer that is too late has no effect.
+        """Answer an application that requests the authority; a late answer has no effect.
 
-        With ``wait``, returns once the proxy has the answer. Raises :class:`RefusedError` if the authority is no longer
-        held, and :class:`LinkError` if the link fails.
+        With ``wait``, return only once the proxy has the answer. Raises :class:`RefusedError` if this application no
+        longer holds the authority, and :class:`LinkError` if the link fails.
         """
         answer = AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON])
         if not wait:
@@ -358,7 +358,7 @@ class CommandSender:
             self._seq, self._connected_ns = 0, self._clock()
 
     def disconnected(self) -> None:
-        """Clear the set-point and the authority so that nothing old is sent on the next connection."""
+        """Clear the set-point and the authority so that the next connection sends nothing old."""
         with self._lock:
             self.schedule.clear(Fate.LINK)
             self.told = None
@@ -386,7 +386,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send everything that is due; return the deadline of the next call, on this process's clock [ns]."""
+        """Send everything that is due; return when to call this next, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
             authority, schedule, present = self._authority, self.schedule, self.is_present(now_ns)
@@ -460,7 +460,7 @@ class CommandSender:
             self.notifier.notify()
 
     def _moved(self, before: AuthorityStatus, now_ns: int) -> None:
-        """Handle a changed status: clear the set-point if the authority was lost, start sending if it was granted."""
+        """Handle a changed status: clear the set-point if the authority was lost; start sending if it was granted."""
         status = self.status
         with self._lock:
             if status.state == "held" and (before.state, before.lease) != ("held", status.lease):
@@ -511,13 +511,13 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
 
 
 def impossible(capabilities: Capabilities) -> dict[type, str]:
-    """Return why actions are unsupported by both the vehicle and its proxy, by type of action."""
+    """Return, by type of action, why neither the vehicle nor its proxy supports it."""
     if not capabilities.actions:
         return dict.fromkeys(ACTION_NAMES, capabilities.why_not or "the vehicle has no commands")
     found: dict[type, str] = {}
     if ACTION_NAMES[EmergencyStop] not in capabilities.actions:
         found[EmergencyStop] = "the vehicle cannot stop its motors"
-    for kind in _LATER_ACTIONS:  # older proxies can't even decode these
+    for kind in _LATER_ACTIONS:  # older proxies can't even decode these actions
         if ACTION_NAMES[kind] not in capabilities.actions | capabilities.software:
             found[kind] = (
                 f"neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a position; an older "

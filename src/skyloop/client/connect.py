@@ -26,11 +26,11 @@ from skyloop.files import wait_readable
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 NAME_TIMEOUT_S: Final = 5.0
-START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle
-WAKE_S: Final = 60.0  #: time limit for a vehicle to start up, which no driver exceeds
-#: Entry-point group with a name per address scheme: functions that return a :class:`Connector`, or None.
+START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle to start
+WAKE_S: Final = 60.0  #: time limit for a vehicle to start up; no driver needs longer
+#: Entry-point group of connectors, named after address schemes; each returns a :class:`Connector` or None.
 CONNECTORS: Final = "skyloop.connectors"
-#: Entry-point group for transports to proxies on other hosts: modules that implement :class:`NetworkTransport`.
+#: Entry-point group of transports to other hosts; each is a module that implements :class:`NetworkTransport`.
 NETWORKS: Final = "skyloop.networks"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address after printing a one-line reason
@@ -40,7 +40,7 @@ _numbers = itertools.count(1)
 
 P = ParamSpec("P")
 R = TypeVar("R")
-#: Where to pass options that earlier versions took directly.
+#: Maps each option that earlier versions took directly to the argument that contains it now.
 _MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
     "keys": "network=skyloop.Network"
 }
@@ -51,10 +51,10 @@ class Network:
     """Where to find drones on other hosts: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
 
     Attributes:
-        address: ``"10.0.0.5:7447"`` connects to an address (or several, separated by commas; ``multicast`` among them
-            also searches); True searches by multicast; False stays on this host. None: the value of the variable
-            ``SKYLOOP_NETWORK`` or, if it is not set, a search by multicast.
-        keys: Folder with an identity; None: the value of the variable ``SKYLOOP_KEYS``.
+        address: An address such as ``"10.0.0.5:7447"``, or several separated by commas (include ``multicast`` to search
+            as well). True searches by multicast, and False stays on this host. None: uses the variable
+            ``SKYLOOP_NETWORK`` or, if the variable is not set, searches by multicast.
+        keys: Folder that contains an identity; None: the folder given by the variable ``SKYLOOP_KEYS``.
     """
 
     address: bool | str | None = None
@@ -62,15 +62,15 @@ class Network:
 
 
 class NetworkSettings(Protocol):
-    """Settings created and interpreted only by their own :class:`NetworkTransport`."""
+    """Settings that only the :class:`NetworkTransport` that created them can interpret."""
 
     @property
     def reach(self) -> str:
-        """Human-readable description of where proxies are searched for."""
+        """Human-readable description of where the transport searches for proxies."""
 
 
 class NetworkTransport(Protocol):
-    """A package's transport to other hosts; :mod:`skyloop.network` is one."""
+    """A package's transport to other hosts, such as :mod:`skyloop.network`."""
 
     def choose(self, network: bool | str | NetworkSettings | None, keys: Path | str | None) -> NetworkSettings | None:
         """Return the network's settings; None to stay on this host. Raises :class:`UsageError`."""
@@ -79,14 +79,14 @@ class NetworkTransport(Protocol):
         """Return a dialer for the proxy with this name."""
 
     def list_proxies(self, settings: NetworkSettings) -> Iterable[Any]:
-        """Return the running proxies, each with a ``name``."""
+        """Return the running proxies; each has a ``name``."""
 
 
 NetworkChoice: TypeAlias = "Network | NetworkSettings | bool | str | None"
 
 
 class ConnectOptions(TypedDict, total=False):
-    """Options of :func:`connect`, documented there."""
+    """Options of :func:`connect`, which documents them."""
 
     access: Access
     name: str | None
@@ -126,35 +126,35 @@ def connect(
 ) -> Drone:
     """Connect to a drone.
 
-    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded. If the vehicle
-    has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After ``timeout_s`` or
-    60 s, it returns anyway, and :meth:`Drone.takeoff` waits for the rest of the time.
+    Returns once the vehicle's state is known and, with ``access="pilot"``, once this application may command it. If the
+    vehicle has just started, the call logs this (``skyloop``) and waits until the vehicle can take off. After
+    ``timeout_s`` or 60 s it returns in any case, and :meth:`Drone.takeoff` waits for the remaining time.
 
     Args:
-        target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
-            For an address, a private proxy is started; it ends with the drone, or with this process. A name is looked
-            up first on this host and then, if ``network`` allows it, on the network.
-        access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
-        name: Name of this application, 1 to 64 characters; None: the running script's.
-        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]; None or 0: 5 s for a name and
-            20 s for an address, followed by 60 s for the vehicle.
+        target: Name of a running proxy, or a vehicle's address, such as ``sim://?seed=3`` or ``video://flight.mp4``.
+            An address starts a private proxy, which ends when the drone is closed or this process ends. A name is
+            looked up first on this host and then, if ``network`` allows it, on the network.
+        access: ``"pilot"`` requests the authority; ``"observe"`` only reads.
+        name: Name of this application, 1 to 64 characters; None: the name of the running script.
+        timeout_s: Time limit for the proxy to answer and the vehicle to start up [s]. None or 0: 5 s for a name or 20 s
+            for an address, then 60 s for the vehicle.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``. A vehicle that
-            others fly is left alone, with a warning in the log.
-        authority: How a pilot requests the authority: its priority, how long it waits, whether it asks the holder
+        on_exit: What an airborne vehicle does at the end of the ``with`` block: ``"land"`` or ``"hover"``. A vehicle
+            flown by another application is left alone, and the log warns about it.
+        authority: How a pilot requests the authority: its priority, how long it waits, and whether it asks the holder
             first. None: ``Authority()``.
-        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: the value of the
-            variable ``SKYLOOP_NETWORK`` or, if it is not set, this host only.
+        network: True, an address, or a :class:`Network` with keys; False searches only this host. None: the value of
+            the variable ``SKYLOOP_NETWORK``; if it is not set, only this host.
 
     Raises:
-        UnknownNameError: If no proxy of this name is running; carries suggestions.
+        UnknownNameError: If no proxy of this name is running; the error suggests similar names.
         NoAnswerError: If the proxy does not answer in time, or sends no feedback.
-        AuthorityError: If the authority is not granted; the text names its holder.
+        AuthorityError: If the authority is not granted; the message names the holder.
         RefusedError: If the proxy refuses the connection.
-        LinkError: If the proxy or the private proxy can't be reached, or ends.
-        UsageError: If an argument is out of range, or the address makes no sense.
-        MissingExtraError: If the network is requested and the extra ``network`` is not installed.
+        LinkError: If the proxy can't be reached or ends.
+        UsageError: If an argument is out of range, or the address is invalid.
+        MissingExtraError: If ``network`` is used and the extra ``network`` is not installed.
     """
     if not isinstance(authority, Authority | None):
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, e.g. Authority(priority=4)")
@@ -173,7 +173,7 @@ def prepare(
     network: NetworkChoice = None,
     **options: Unpack[DroneOptions],
 ) -> tuple[Drone, float]:
-    """Return an unconnected drone and the deadline for connecting it (on ``time.monotonic``).
+    """Return an unconnected drone and the deadline for connecting to it (on ``time.monotonic``).
 
     Starts a private proxy if needed. Arguments and errors are those of :func:`connect`.
     """
@@ -184,7 +184,7 @@ def prepare(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" not in target:
-        # Other processes can use the bare name only if they find the proxy without network settings.
+        # Other processes can use the bare name only if they can find the proxy without network settings.
         options["reach"] = target if network is None or network is False else None
         return Drone(dial_by_name(target, network), app=app, **options), deadline
     way = _connector(target)
@@ -197,7 +197,7 @@ def prepare(
 
 
 def _connector(uri: str) -> Connector:
-    """Return an installed package's connector for this scheme, or a private proxy."""
+    """Return the connector that an installed package provides for this scheme, or a private proxy."""
     for entry in entry_points(group=CONNECTORS, name=uri.partition("://")[0]):
         own: Connector | None = entry.load()(uri)
         if own is not None:
@@ -206,51 +206,51 @@ def _connector(uri: str) -> Connector:
 
 
 def _script_name() -> str:
-    """Return the running script's name for display."""
+    """Return the name of the running script for display."""
     script = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python")
     stem = script.parent.name if script.stem == "__main__" else script.stem
     return (stem.strip("-") or "python")[:64]
 
 
 class Connector(Protocol):
-    """Access to a vehicle by address: through a private proxy, or within this process."""
+    """Access to a vehicle by its address, either through a private proxy or within this process."""
 
     scheduler: Scheduler
 
     @property
     def reach(self) -> str | None:
-        """The target for other processes to reach the same vehicle; None if they can't."""
+        """The target with which other processes can reach the same vehicle; None if they can't reach it."""
 
     def dialer(self, deadline_s: float) -> Dialer:
-        """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``."""
+        """Return a dialer whose first call waits for the proxy until ``deadline_s`` (on ``time.monotonic``)."""
 
     def close(self) -> None:
-        """Stop everything that was started. Idempotent."""
+        """Stop everything that this connector started. Idempotent."""
 
 
 class PrivateProxy:
     """Runs ``python -m skyloop proxy URI`` as a child process.
 
-    The child ends on :meth:`close` and whenever this process ends, but first lands a vehicle that is still flying for
-    it. Ctrl-C reaches only the application, which can then land.
+    The child ends on :meth:`close` or when this process ends. If the vehicle is still flying for this process, the
+    child lands it first. Ctrl-C reaches only the application, which can then land the vehicle.
     """
 
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
-        """Start the child; ``command`` is its command line, to which the address is added."""
+        """Start the child with the command line ``command``, to which the address is added."""
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
         self.reach = self.name
         self.uri = shown_address(uri)
         self.scheduler = Scheduler()
-        self._served = False  # whether it has served a client, and therefore may have a vehicle in the air
+        self._served = False  # whether it has served a client, whose vehicle may be in the air
         self._process = ChildProcess([*command, self.uri, "--name", self.name, "--parent-fd", "0"], handed=uri)
         self.pid = self._process.pid  #: process id of the child
 
     def dialer(self, deadline_s: float) -> Dialer:
         """Return a dialer whose first call waits for the proxy until ``deadline_s``, a time on ``time.monotonic``.
 
-        The dialer raises :class:`NoAnswerError` if this takes too long, :class:`UsageError` if the address is invalid,
-        and :class:`LinkError`, with the end of the child's standard error, if the child has ended.
+        The dialer raises :class:`NoAnswerError` if the proxy takes too long and :class:`UsageError` if the address is
+        invalid. If the child has ended, it raises :class:`LinkError` with the last part of the child's standard error.
         """
         inner = _local(self.name)
 
@@ -274,9 +274,9 @@ class PrivateProxy:
         return dial
 
     def close(self) -> None:
-        """End the child and wait for it, for at most 4 s while it lands a flying vehicle. Idempotent.
+        """End the child; if it is landing a flying vehicle, wait for it for at most 4 s. Idempotent.
 
-        A child that never served is terminated after 4 s, and killed after another 4 s.
+        A child that never served a client is terminated after 4 s and killed after another 4 s.
         """
         self._process.part()
         if not self._served or self._process.wait(GRACE_S) is not None:
@@ -294,7 +294,7 @@ class PrivateProxy:
         raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 
     def _wait_for_output(self) -> None:
-        """Sleep until the child prints something (such as its readiness), it ends, or a short time has passed."""
+        """Sleep until the child prints something (such as its readiness) or ends, or until a short time has passed."""
         stdout = self._process.stdout
         if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
             time.sleep(0.005)  # the child has closed its output and is about to exit
@@ -311,7 +311,7 @@ def network_settings(network: NetworkChoice = None, keys: Path | str | None = No
             address = True
         return network_settings(address, keys)
     if network is False or (network is None and keys is None and not os.environ.get(NETWORK_VARIABLE)):
-        return None  # without importing the network's packages
+        return None  # avoids importing the network's packages
     return _network().choose(network, keys)
 
 
@@ -325,8 +325,8 @@ def _network() -> NetworkTransport:
 def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     """Return a dialer for the proxy with this name.
 
-    Each call prefers a proxy on this host, if Linux' local transport is available. The dialer raises
-    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`. This function raises
+    Each call prefers a proxy on this host if the local transport (Linux only) is available. The dialer raises
+    :class:`LinkError`, or :class:`UnknownNameError`, whose text lists where it searched. This function raises
     :class:`UsageError` if ``name`` is not a valid name.
     """
     check_name(name)
@@ -342,7 +342,7 @@ def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
         try:
             return near(handler)
         except LinkError:
-            return far(handler)  # the name is a killed proxy's leftover socket, or belongs to another user
+            return far(handler)  # the name is the leftover socket of a killed proxy, or belongs to another user
         except UnknownNameError as here:
             known = here.known
         try:
@@ -371,7 +371,7 @@ def _hinting(near: Dialer) -> Dialer:
 
 
 def running_names(network: NetworkChoice = None) -> list[str]:
-    """Return the sorted names of running proxies on this host and, if requested, on the network."""
+    """Return the sorted names of the proxies running on this host and, if requested, on the network."""
     from skyloop.transport.local import list_names
 
     near = {proxy.name for proxy in list_names()}

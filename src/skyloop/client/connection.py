@@ -1,4 +1,4 @@
-"""The connection to a proxy: a series of supervised sessions, re-established after every loss."""
+"""Connect to a proxy with a series of supervised sessions, re-established after every loss."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from skyloop.messages import AnyReply, AnyRequest, Hello, LinkState, Refused, We
 from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
-_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
+_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples retries receiving them itself
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class RedialPolicy:
-    """Policy for reconnecting to a lost proxy: retry forever, with increasing pauses [s]."""
+    """Policy for reconnecting to a lost proxy: retry forever, with increasing pauses."""
 
     first_s: float = 0.02
     factor: float = 2.0
@@ -36,7 +36,7 @@ class RedialPolicy:
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def pause_s(self, failures: int) -> float:
-        """Return the pause before the next attempt after ``failures`` failed ones [s]."""
+        """Return the pause before the next attempt, after ``failures`` failed attempts [s]."""
         return float(min(self.cap_s, self.first_s * self.factor ** min(failures, 30)))
 
 
@@ -47,7 +47,7 @@ class _EndedError(LinkError):
 class ProxyConnection:
     """Sends an application's packets and requests through the current session with the proxy. Thread-safe.
 
-    It is created before everything that uses it; a :class:`ConnectionSupervisor` creates the sessions.
+    It is created before all objects that use it; a :class:`ConnectionSupervisor` creates its sessions.
     """
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
@@ -55,7 +55,7 @@ class ProxyConnection:
         self.transmit: Callable[[bytes], bool] = _nowhere
         self.state = LinkState.CONNECTING
         self.reason = ""
-        self.why_closed = ""  #: why requests are not possible; empty while they are
+        self.why_closed = ""  #: why requests can't be made; empty while they can
         self.poked = False  #: whether the supervisor must run immediately
         self.closing = False
         self.woken = Notifier()  #: wakes the supervisor
@@ -67,7 +67,7 @@ class ProxyConnection:
 
     @property
     def connected(self) -> bool:
-        """Whether a proxy is at the other end and has answered Hello, as far as is known."""
+        """Whether, as far as is known, a proxy is connected and has answered Hello."""
         session = self.session
         return session is not None and session.open
 
@@ -85,13 +85,13 @@ class ProxyConnection:
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is the receiving one, which must not wait for packets."""
+        """Whether the calling thread is the receiving thread, which must not wait for packets."""
         session = self.session
         return session is not None and session.receiving
 
     @property
     def variants(self) -> bool:
-        """Whether frames arrive as requested; within one host, they arrive unchanged."""
+        """Whether the proxy adapts frames as requested; within one host, frames arrive unchanged."""
         session = self.session
         return session is not None and session.variants
 
@@ -108,22 +108,22 @@ class ProxyConnection:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`offset_ns` [ns]; 0 if both ends read the same clock."""
+        """Maximum error of :attr:`offset_ns` [ns]; 0 if both processes read the same clock."""
         session = self.session
         return 0 if session is None else session.uncertainty_ns
 
     def check_open(self) -> None:
-        """Raise :class:`ClosedError` if the drone was closed, or belongs to the parent process."""
+        """Raise :class:`ClosedError` if the drone was closed, or if it belongs to the parent process."""
         if self.why_closed:
             raise ClosedError(self.why_closed)
 
     def check_may_wait(self) -> None:
-        """Raise :class:`UsageError` on the receiving thread."""
+        """Raise :class:`UsageError` if called on the receiving thread."""
         if self.receiving:
             raise UsageError("an inline callback can't wait for packets that it would itself have to receive")
 
     def poke(self) -> None:
-        """Wake the supervisor so that it attends to the connection now."""
+        """Wake the supervisor to make it attend to the connection now."""
         self.poked = True
         self.woken.notify()
 
@@ -133,7 +133,7 @@ class ProxyConnection:
         return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to or unsubscribe from a topic, in this session and all later ones."""
+        """Subscribe to or unsubscribe from a topic, in this session and in all later sessions."""
         with self._lock:
             if on == (topic in self._topics):
                 return
@@ -145,7 +145,7 @@ class ProxyConnection:
                 self.session.subscribe(topic, on)
 
     def resubscribe(self, topic: str) -> None:
-        """Resubscribe to a topic that seems to have stopped."""
+        """Resubscribe to a topic that seems to have stopped delivering samples."""
         with self._lock:
             if topic in self._topics and self.session is not None:
                 self.session.subscribe(topic, False)
@@ -154,7 +154,7 @@ class ProxyConnection:
     def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
         """Send a request without waiting.
 
-        ``done`` is called once, on any thread, with the answer or, after ``timeout_s``, an error; it must be quick.
+        ``done`` is called once, on any thread, with the answer or, after ``timeout_s``, an error. It must be quick.
         """
         session = self.session
         if session is None:
@@ -165,15 +165,15 @@ class ProxyConnection:
     def call(
         self, body: Callable[[], AnyRequest], timeout_s: float = 2.0, *, may_repeat: Callable[[], bool] = lambda: True
     ) -> AnyReply:
-        """Send a request and wait for the answer. While the link is lost, wait for it to return.
+        """Send a request and wait for the answer. If the link is lost, wait for it to be restored.
 
-        ``body`` returns the request and is called for each attempt. ``may_repeat``: whether to repeat it if the link
-        breaks between sending it and receiving the answer.
+        ``body`` is called for each attempt and returns the request. ``may_repeat``: whether to repeat the request if
+        the link breaks after it is sent and before the answer arrives.
 
         Raises:
-            NoAnswerError: If there is no answer in time.
+            NoAnswerError: If no answer arrives in time.
             ClosedError: If the drone is closed.
-            LinkError: If called from an inline callback, or the request may have been executed.
+            LinkError: If called from an inline callback, or if the link broke and the request may have been executed.
         """
         if self.receiving:
             raise LinkError("an inline callback can't wait for an answer that it would itself have to receive")
@@ -200,7 +200,7 @@ class ProxyConnection:
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:
-        """Stop sending and waiting, because the session belongs to the parent process."""
+        """Stop sending and waiting in a forked process, because the session belongs to the parent process."""
         self.why_closed = (
             f"this drone belongs to process {os.getppid()}, of which this one is a fork: connect again here"
         )
@@ -231,7 +231,7 @@ class ProxyConnection:
 
 
 class ConnectionSupervisor:
-    """Creates sessions with the proxy, evaluates their links, and replaces lost ones."""
+    """Creates sessions with the proxy, evaluates their links, and replaces lost sessions."""
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class ConnectionSupervisor:
     ) -> None:
         """Prepare to connect; :meth:`start` makes the connection.
 
-        ``begin`` arranges calls of :meth:`attend` from the first session on; if None, a separate thread makes them.
+        ``begin`` arranges calls of :meth:`attend` from the first session on; if None, a separate thread calls it.
         """
         self.connection = connection
         self._handler = handler
@@ -259,10 +259,10 @@ class ConnectionSupervisor:
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
 
     def start(self, timeout_s: float = 5.0) -> None:
-        """Make the first connection, within ``timeout_s``, and stay connected from then on.
+        """Make the first connection within ``timeout_s``, and stay connected from then on.
 
         Raises :class:`NoAnswerError` if the proxy does not answer Hello, :class:`RefusedError` if it refuses the
-        connection, and the dialer's errors.
+        connection, and any error of the dialer.
         """
         deadline = time.monotonic() + timeout_s
         ended = False
@@ -273,7 +273,7 @@ class ConnectionSupervisor:
             except NoAnswerError:  # Hello may have been lost, or the proxy may be slow to start
                 if time.monotonic() > deadline:
                     raise
-            except _EndedError:  # the proxy has just failed to start: dialing again raises the reason
+            except _EndedError:  # the proxy has just failed to start; dialing again raises the reason
                 if ended:
                     raise
                 ended = True
@@ -285,7 +285,7 @@ class ConnectionSupervisor:
         self.connection.poke()
         started, me = self._thread.ident, threading.get_ident()
         if started not in (None, me) and not self.connection.receiving:
-            self._thread.join()  # except when called from an inline callback or from the thread itself
+            self._thread.join()  # not possible from an inline callback or the thread itself
         self._drop(ClosedError("this drone was closed"), "closed by the application")
         self._set_state(LinkState.CLOSED, "closed by the application")
 
@@ -348,7 +348,7 @@ class ConnectionSupervisor:
         return 0.0
 
     def _connect(self) -> None:
-        """Dial and send Hello. The attempt counts as failed, lengthening the next pause, until feedback arrives."""
+        """Dial and send Hello. Until feedback arrives, the attempt counts as failed and lengthens the next pause."""
         self._failures += 1
         session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock, self._dial)
         try:
@@ -402,7 +402,7 @@ def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to
 
 
 class ReceivingNotifier(Notifier):
-    """A notifier whose waiting thread receives samples itself, so that a sample wakes it directly."""
+    """A notifier whose waiting thread receives samples itself, which lets a sample wake it directly."""
 
     __slots__ = ("_connection",)
 
@@ -434,10 +434,10 @@ def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
 class Scheduler:
     """Provides a drone's time. Here it is real time: waits sleep, and an application that is too slow misses samples.
 
-    A replay stepped by its application has a different scheduler, in which waiting advances the time.
+    A replay stepped by its application uses another scheduler, in which waiting advances the time.
     """
 
-    #: Whether callbacks always run on the receiving thread, so that each receives every sample.
+    #: Whether callbacks always run on the receiving thread, where each of them receives every sample.
     in_step = False
 
     def __init__(self, clock: Clock = time.monotonic_ns) -> None:
@@ -448,7 +448,7 @@ class Scheduler:
         return Notifier()
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:
-        """Return a notifier for a thread that waits only for samples of this connection."""
+        """Return a notifier for a thread that waits only for samples from this connection."""
         return ReceivingNotifier(connection)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
@@ -456,4 +456,4 @@ class Scheduler:
         supervisor.attend_for_ever()
 
     def opened(self) -> None:
-        """Handle completion of the connection: the drone's state is known, and a pilot may command it."""
+        """Handle the completed connection: the drone's state is known, and a pilot may command it."""

@@ -1,4 +1,4 @@
-"""The drone as an application sees it: commands, readings, callbacks and the end of a flight."""
+"""The drone as an application sees it: commands, sensor readings, callbacks, and the end of a flight."""
 
 from __future__ import annotations
 
@@ -92,10 +92,10 @@ R = TypeVar("R")
 T = TypeVar("T")
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
-EVENT_DEPTH: Final = 256  #: maximum number of events, log entries and so on waiting for a slow callback
-WHOLE_S: Final = 1.0  #: time limit for a complete sample of feedback, if a reduced rate was requested [s]
+EVENT_DEPTH: Final = 256  #: maximum number of events or log entries waiting for a slow callback
+WHOLE_S: Final = 1.0  #: time limit for a complete sample of feedback if a reduced rate was requested [s]
 _CAMERA_CHECK_S: Final = 0.5  #: how often a thread waiting for a frame checks that its camera still exists
-_SOON_S: Final = 1.0  #: time after which a vehicle that is still starting up is reported in the log
+_SOON_S: Final = 1.0  #: time after which the log reports that a vehicle is still starting up
 _ENDED: Final = EndedSessions()  #: shared by all drones of this process
 _log = logging.getLogger("skyloop")
 
@@ -103,14 +103,14 @@ _log = logging.getLogger("skyloop")
 class DroneOptions(TypedDict, total=False):
     """Options of a :class:`Drone`."""
 
-    access: Access  #: ``"pilot"`` may command, ``"observe"`` only reads
+    access: Access  #: ``"pilot"`` may send commands; ``"observe"`` only reads
     rate_hz: float  #: rate at which commands are repeated, 1 to 200 Hz
     stall_s: float  #: time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never
     on_exit: OnExit  #: what an airborne vehicle does at the end of the block
     policy: RedialPolicy | None  #: when to reconnect, and when a link counts as lost
-    scheduler: Scheduler | None  #: provides the current time and ways to wait; None: real time
+    scheduler: Scheduler | None  #: provides the current time and the ways to wait; None: real time
     on_close: Callable[[], None] | None  #: called at the end of :meth:`Drone.close`, on the closing thread
-    reach: str | None  #: name or address at which other processes can reach the vehicle; None if they can't
+    reach: str | None  #: name or address at which other processes can reach the vehicle; None: they can't
 
 
 def by_name(function: Callable[P, R]) -> Callable[P, R]:
@@ -123,7 +123,7 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **given)
         except TypeError as error:
             if error.__traceback__ is None or error.__traceback__.tb_next is not None:
-                raise  # raised within the function, not by the call itself
+                raise  # the function raised it, not the call itself
             for unknown in given.keys() - known:
                 raise UnknownNameError(f"argument of {function.__name__}", unknown, known) from None
             first = f"{function.__name__}({known[0]}={args[1]!r:.20})" if len(args) > 1 else "its own"
@@ -133,9 +133,9 @@ def by_name(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _all_finite(a: object, b: object, c: object, d: object) -> bool:
-    """Return whether four values are floats that can be commanded unchanged, without calling :func:`number` for each.
+    """Return whether four values are finite floats that can be sent unchanged; avoids calling :func:`number` for each.
 
-    False does not mean that they are invalid: ints, or four huge floats whose sum overflows, may be valid.
+    False does not mean that the values are invalid: ints may be valid, and so may four huge floats whose sum overflows.
     """
     floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
     return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
@@ -144,20 +144,21 @@ def _all_finite(a: object, b: object, c: object, d: object) -> bool:
 class Drone:
     """A connected vehicle, returned by :func:`skyloop.connect`.
 
-    It is a context manager, and every method is thread-safe. At the end of its block, a drone that is in the air under
-    this application's authority lands, and the authority is released. Once that end has begun, commands from
-    other threads raise :class:`ClosedError`, except for an emergency stop. A drone that others are flying is left
-    alone, and a drone returning because its battery is low continues to return. ``sys.exit()`` in a callback ends the
-    flight in the same way. Ctrl-C, or a notebook's *Stop*, during a call that waits makes the vehicle hover; during
-    :meth:`land` the landing continues. With ``wait=False``, there is nothing to interrupt. A lost connection to the
-    proxy is re-established, however long that takes, and everything except old set-points is restored.
+    It is a context manager, and every method is thread-safe. At the end of its ``with`` block, a drone that is flying
+    under this application's authority lands, and the authority is released. Once the end has begun, commands from other
+    threads raise :class:`ClosedError`, except for an emergency stop. A drone that another application is flying is left
+    alone, and a drone that is returning because of a low battery continues to return. ``sys.exit()`` in a callback ends
+    the flight in the same way. Pressing Ctrl-C (or a notebook's *Stop*) while a call waits makes the vehicle hover;
+    during :meth:`land`, the landing continues. With ``wait=False``, calls don't wait and can't be interrupted. A lost
+    connection to the proxy is re-established, however long that takes. Then everything but old set-points is restored.
 
-    Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
-    it is sent at once and repeated at ``rate_hz`` until the next one. All commands except :meth:`takeoff` and
-    :meth:`land` return True if the command was handed to the transport. They return False while the link is down or the
-    authority has not been granted yet; the command is sent once both are available, unless it is more than 0.5 s old by
-    then. Set-points (velocity, attitude, position) also return False while the proxy is known to refuse them, for
-    example on the ground or while others fly the vehicle; events give the reason. Every command raises:
+    Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command describes the full desired
+    state. It is sent immediately and then repeated at ``rate_hz`` until the next command. All commands except
+    :meth:`takeoff` and :meth:`land` return True if the command was handed to the transport. They return False while the
+    link is down or the authority has not been granted yet. The command is then sent once both are available, unless it
+    is more than 0.5 s old by that time. Set-points (velocity, attitude, position) also return False while the proxy is
+    known to refuse them, for example on the ground or while another application flies the vehicle. Events give the
+    reason. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
@@ -197,8 +198,8 @@ class Drone:
         scheduler = scheduler or Scheduler()
         self._reach = reach
         self._on_close = on_close
-        self._read: Feedback | None = None  # the last sample returned by feedback() or next_feedback()
-        # Each object uses only those created before it; the receiver handles the samples of every session.
+        self._read: Feedback | None = None  # the last sample that feedback() or next_feedback() returned
+        # Each object uses only objects created before it; the receiver handles the samples of every session.
         connection = self._connection = ProxyConnection(scheduler.clock)
         authority = AuthorityTracker(app, _ENDED)
         state = self._state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
@@ -229,8 +230,8 @@ class Drone:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
         ``timeout_s`` limits the wait for the proxy's answer, for the first feedback and, as a pilot, for the vehicle to
-        start up; once the vehicle may be commanded, starting up may take ``wake_s`` if that is longer. With
-        ``acquire=False``, a pilot does not request the authority yet. Raises the errors of :func:`skyloop.connect`.
+        start up. If ``wake_s`` is longer, it limits starting up once the vehicle accepts commands. With
+        ``acquire=False``, a pilot requests no authority yet. Raises the errors of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -298,7 +299,7 @@ class Drone:
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Maximum error of :attr:`clock_offset_ns` [ns], and so of ages and delays; 0 if both use the same clock."""
+        """Maximum error of :attr:`clock_offset_ns`, and thus of ages and delays [ns]; 0 if both use the same clock."""
         return self._connection.uncertainty_ns
 
     @property
@@ -308,9 +309,9 @@ class Drone:
 
     @property
     def link(self) -> LinkStatus:
-        """State of both hops: application to proxy, and proxy to vehicle.
+        """State of both links: from the application to the proxy, and from the proxy to the vehicle.
 
-        ``reason`` explains the last change or, while the proxy is lost, the last failed attempt to reconnect.
+        ``reason`` explains the last change or, while the proxy is lost, why the last attempt to reconnect failed.
         """
         status = self._state.status
         return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
@@ -323,15 +324,15 @@ class Drone:
 
     @property
     def closed(self) -> bool:
-        """Whether :meth:`close` was called."""
+        """Whether :meth:`close` has been called."""
         return self._connection.why_closed != ""
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
-        The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
-        callback. Otherwise it is the delay for all pilots, which takes up to 0.2 s to request from the proxy.
+        While :meth:`on_command` has a callback, the delay of ``command`` is measured from the echoes of this
+        application's own commands. Otherwise, it covers all pilots and is requested from the proxy (up to 0.2 s).
         """
         found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
@@ -345,12 +346,12 @@ class Drone:
         return list(self._state.recent)
 
     def on_takeover(self, function: Callable[[TakeoverRequest], TakeoverAnswer]) -> Listener[Event]:
-        """Call ``function`` when another application requests the authority that this one holds.
+        """Call ``function`` when another application requests the authority that this application holds.
 
         Args:
-            function: Called in its own thread. It returns True to hand the authority over, False or a reason (a text)
-                to decline, and None to leave the decision to the proxy. In any case, a strictly higher priority wins
-                after the proxy's ``authority.ask_s``.
+            function: Called in a thread of its own. It returns True to hand over the authority, False or a reason (a
+                string) to decline, or None to leave the decision to the proxy. In any case, an application with a
+                strictly higher priority wins after the proxy's ``authority.ask_s``.
 
         Raises:
             UsageError: If ``function`` can't be called.
@@ -362,7 +363,7 @@ class Drone:
 
     @property
     def authority(self) -> AuthorityStatus:
-        """Current state of this application's authority."""
+        """Current status of this application's authority."""
         return self._commands.status
 
     def request_authority(
@@ -376,24 +377,24 @@ class Drone:
     ) -> AuthorityStatus:
         """Request the authority and wait for it.
 
-        A holder of lower priority is pre-empted at once. With ``takeover="ask"`` it is asked first, and pre-empted when
-        it agrees or after the proxy's ``authority.ask_s``; a holder of the same or higher priority is also asked, and
-        may decline. Once granted, the authority is kept: after the link is lost it is requested again, and after a
-        pre-emption it is regained when the other application releases it.
+        By default, a holder of lower priority is pre-empted immediately. With ``takeover="ask"``, the holder is asked
+        first. A holder of lower priority is pre-empted when it agrees or after the proxy's ``authority.ask_s``. A
+        holder of the same or higher priority may decline. Once granted, the authority is kept: it is requested again
+        after a lost link, and regained after a pre-emption when the other application releases it.
 
         Args:
-            priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the last request.
+            priority: Priority from 0 (highest) to 31 (lowest); None: the priority of the previous request.
             wait_s: Maximum time to wait in the queue [s].
             for_s: How long to hold the authority [s], up to a day; after that, others can acquire it. None: unlimited.
-            takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks it first.
-            stay: Whether to stay in the queue after ``wait_s`` instead of raising.
+            takeover: ``"now"`` pre-empts a holder of lower priority immediately; ``"ask"`` asks the holder first.
+            stay: Whether to remain in the queue after ``wait_s`` instead of raising an error.
 
         Returns:
-            The status: held or, if ``stay`` is True, possibly queued, including the position and the expected wait.
+            The status: held or, if ``stay`` is True, possibly queued, with the position and the expected waiting time.
 
         Raises:
-            AuthorityError: If it is not granted within ``wait_s`` (the message names the holder), if the proxy refuses
-                it, or if this application only observes.
+            AuthorityError: If the authority is not granted within ``wait_s`` (the message names the holder), if the
+                proxy refuses the request, or if this application is only an observer.
             NoAnswerError: If the proxy does not answer the request.
             UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
             ClosedError: If the drone was closed.
@@ -403,9 +404,9 @@ class Drone:
         return self._commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
-        """Release the authority or leave the queue, and wait until the proxy confirms it.
+        """Release the authority or leave the queue, and wait for the proxy's confirmation.
 
-        Does nothing if the authority is neither held nor requested.
+        Does nothing if this application neither holds nor requests the authority.
 
         Raises:
             NoAnswerError: If the proxy does not answer.
@@ -425,23 +426,22 @@ class Drone:
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
-        If the vehicle is not ready yet, the take-off is retried twice a second during the wait. If the call fails, for
-        example by a time-out or Ctrl-C, the take-off is cancelled: the vehicle hovers if it is in the air, otherwise
-        it stays on the ground. Without ``wait``, a refused take-off is not retried.
+        If the vehicle is not ready yet, the take-off is retried twice a second while the call waits. If the call fails,
+        for example because of a time-out or Ctrl-C, the take-off is cancelled: the vehicle hovers if it is in the air,
+        and otherwise stays on the ground. Without ``wait``, a refused take-off is not retried.
 
         Args:
-            wait: Wait until the vehicle hovers or flies; otherwise only send the command.
-            timeout_s: How long to wait [s].
+            wait: Whether to wait until the vehicle hovers or flies, rather than only send the command.
+            timeout_s: Maximum time to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle does not hover in time; the message gives its state and, if known, the reason.
-            RefusedError: If the proxy refuses the take-off in the present state; if a failsafe, a lost link, a new
+            NoAnswerError: If the vehicle does not hover in time; the message gives its state and the reason, if known.
+            RefusedError: If the proxy refuses the take-off in the current state; if a failsafe, a lost link, a new
                 lease or another command of this application ends it before it takes effect; if the application lands
-                the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for whatever
-                reason.
+                the vehicle or stops its motors; or if the vehicle lands or disarms before it hovers, for any reason.
             UnsupportedError: If the vehicle can't take off.
-            LinkError: If the link is down and ``wait`` is False; the vehicle won't take off later, either.
-            AuthorityError: If the authority is not held, or another application takes it over.
+            LinkError: If the link is down and ``wait`` is False; the take-off is not sent later.
+            AuthorityError: If this application does not hold the authority, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent in that case.
         """
@@ -450,41 +450,41 @@ class Drone:
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the current position.
 
-        A landing interrupted by a failsafe, a lost link or a lost lease is commanded again during the wait. If the
+        During the wait, a landing interrupted by a failsafe, a lost link or a lost lease is commanded again. If the
         vehicle's own link breaks, the proxy continues the landing, even if no application is waiting for it.
 
         Args:
-            wait: Wait until the vehicle has landed; otherwise only send the command.
+            wait: Whether to wait until the vehicle has landed, rather than only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If the vehicle has not landed in time; the message gives its state and, if known, the reason.
-            RefusedError: If the proxy refuses to land in the present state.
+            NoAnswerError: If the vehicle has not landed in time; the message gives its state and the reason, if known.
+            RefusedError: If the proxy refuses the landing in the current state.
             UnsupportedError: If the vehicle can't land.
-            LinkError: If the link is down and ``wait`` is False; the landing is still sent within 0.5 s if possible.
+            LinkError: If the link is down and ``wait`` is False; if possible, the landing is still sent within 0.5 s.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If called with ``wait`` from an inline callback; the landing is commanded anyway.
+            UsageError: If called with ``wait`` from an inline callback; the landing is still commanded.
         """
         self._piloting.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
-        """Stop and hold the position. For return values and exceptions, see :class:`Drone`."""
+        """Stop and hold position. See :class:`Drone` for return values and exceptions."""
         return self._commands.command(Hover())
 
     def idle(self) -> bool:
-        """Keep the authority and leave the vehicle as it is."""
+        """Keep the authority without changing what the vehicle does."""
         return self._commands.command(Idle())
 
     @by_name
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Fly at a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
+        """Fly at a velocity given in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
         Args:
-            forward: Along x, forward [m/s].
-            left: Along y, to the left [m/s].
-            up: Along z, up [m/s].
-            yaw_rate: Counter-clockwise seen from above [rad/s].
+            forward: Velocity along x, forward [m/s].
+            left: Velocity along y, to the left [m/s].
+            up: Velocity along z, up [m/s].
+            yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
 
         Returns:
             True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
@@ -496,12 +496,12 @@ class Drone:
 
     @by_name
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Hold an attitude with a climb rate.
+        """Hold an attitude while climbing or descending at a given rate.
 
         Args:
-            roll: Right side down is positive and accelerates to the right [rad].
-            pitch: Nose down is positive and accelerates forward [rad].
-            climb: Vertical velocity, up [m/s].
+            roll: Roll [rad]; right side down is positive and accelerates the vehicle to the right.
+            pitch: Pitch [rad]; nose down is positive and accelerates the vehicle forward.
+            climb: Vertical velocity, up positive [m/s].
             yaw_rate: Counter-clockwise seen from above [rad/s].
 
         Returns:
@@ -531,38 +531,36 @@ class Drone:
     ) -> None:
         """Fly straight to a position and hold it.
 
-        World axes are those of ``Feedback.position_m``. If the vehicle knows its geographic position
-        (``Feedback.origin``), latitude and longitude may be given instead; they are converted during this call.
-        ArduPilot and PX4 fly there natively; for other vehicles the proxy sends velocities. Unlike a velocity, a
-        position does not decay when the application stops sending: the vehicle stops there. It is held until the next
-        command, even after a time-out; after Ctrl-C or a cancelled task, the vehicle hovers. The flight does not avoid
-        obstacles.
+        The world axes are the same as for ``Feedback.position_m``. If the vehicle knows its geographic position
+        (``Feedback.origin``), you can give latitude and longitude instead; this call converts them. ArduPilot and PX4
+        fly to the position natively; for other vehicles, the proxy sends velocities. Unlike a velocity, a position does
+        not decay when the application stops sending: the vehicle stops there. The vehicle holds the position until the
+        next command, even after a time-out; after Ctrl-C or a cancelled task, it hovers. It does not avoid obstacles.
 
         Args:
-            x: East [m].
-            y: North [m].
+            x: Distance east of the origin [m].
+            y: Distance north of the origin [m].
             z: Up [m].
-            latitude_deg: Latitude [°], north positive; an alternative to x, y and z.
+            latitude_deg: Latitude [°], north positive; used instead of x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
-            yaw: Yaw to reach on the way, counter-clockwise from x [rad]; None: keep the current yaw.
-            speed: Maximum speed on the way [m/s]; None: ``limits.speed`` and ``limits.climb``, which always apply.
-            wait: Wait until the vehicle has arrived and is nearly at rest; otherwise only send the command.
+            yaw: Yaw to turn to during the flight, counter-clockwise from x [rad]; None: keep the current yaw.
+            speed: Maximum speed [m/s], within ``limits.speed`` and ``limits.climb``; None: these limits only.
+            wait: Whether to wait until the vehicle has arrived and is nearly at rest, or only send the command.
             timeout_s: How long to wait [s].
-            tolerance_m: Maximum distance from the position at arrival [m].
-            tolerance_rad: Maximum deviation from ``yaw`` at arrival [rad].
+            tolerance_m: Maximum distance from the position on arrival [m].
+            tolerance_rad: Maximum deviation from ``yaw`` on arrival [rad].
 
         Raises:
-            NoAnswerError: If it has not arrived in time; the message gives its state and, if known, the reason.
-            RefusedError: If the proxy refuses it, for example because the vehicle's position is unknown, the target is
-                outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command
-                ends it. Also if latitude and longitude are given but the vehicle's geographic position is unknown.
+            NoAnswerError: If the vehicle has not arrived in time; the message gives its state and the reason, if known.
+            RefusedError: If the proxy refuses the flight, for example because the vehicle's position is unknown, the
+                target is outside the safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or
+                another command ends the flight. Also if latitude and longitude are given but the vehicle's are unknown.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: If the link is down and ``wait`` is False; the vehicle won't fly there later, either.
+            LinkError: If the link is down and ``wait`` is False; the command is not sent later.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
-            UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
-                nothing is sent in that case.
+            UsageError: If a number is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
         """
         newest = self._state.newest
         age_s = math.inf if newest is None else self.age_s(newest)
@@ -574,25 +572,25 @@ class Drone:
     def return_to_start(
         self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
-        """Fly back to where the vehicle took off, and land there or hover.
+        """Fly back to where the vehicle took off, and then land or hover.
 
-        The vehicle climbs straight up to a safe height if it is lower, within ``limits.altitude``, the ceiling of the
-        room and the top of the safety box. It flies straight to a point above its start (:attr:`start_position`) as
-        :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends the flight. Obstacles are not
-        avoided.
+        If the vehicle is below a safe height, it first climbs straight up, within ``limits.altitude``, the ceiling of
+        the room and the top of the safety box. It then flies straight to a point above its start
+        (:attr:`start_position`), as :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends
+        the flight. The vehicle does not avoid obstacles.
 
         Args:
-            height_m: Minimum height above the start on the way [m]; None: the parameter ``return.height``.
-            land: Whether to land there instead of hovering above it; None: the parameter ``return.land``.
-            wait: Whether to wait until it has landed, or hovers above its start, rather than only send the command.
+            height_m: Minimum height above the start during the flight [m]; None: the parameter ``return.height``.
+            land: Whether to land at the start instead of hovering above it; None: the parameter ``return.land``.
+            wait: Whether to wait until the vehicle has landed or hovers above its start, or only send the command.
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If it has not ended in time; the message gives the vehicle's state and, if known, the reason.
-            RefusedError: If the proxy refuses it, for example because position or start are unknown, the vehicle is not
-                flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
+            NoAnswerError: If the flight does not end in time; the message gives the vehicle's state and a known reason.
+            RefusedError: If the proxy refuses the flight, for example because the position or start is unknown, the
+                vehicle is not flying, or a no-fly zone is in the way; or if a failsafe or another command ends it.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a position.
-            LinkError: If the link is down and ``wait`` is False; the vehicle won't return later, either.
+            LinkError: If the link is down and ``wait`` is False; the command is not sent later.
             AuthorityError: If the authority is not held, or another application takes it over.
             ClosedError: If the drone is closed.
             UsageError: If an argument is invalid, or if called with ``wait`` from an inline callback; nothing is sent.
@@ -600,20 +598,20 @@ class Drone:
         self._piloting.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
-        """Cut the motors at once: the vehicle falls.
+        """Cut the motors immediately: the vehicle falls.
 
-        Requires ``access="pilot"`` but not the authority. The stop is sent at once and repeated until the vehicle
-        reports it (``FlightState.EMERGENCY``); after 8 s it is abandoned with an event (``vehicle_message``, reason
-        ``stop_given_up``). Until then this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
-        return False, :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program that flies over several
-        connections must itself stop the others from sending. A stop that could not be sent for 2 s is not sent later.
+        Requires ``access="pilot"`` but not the authority. The stop is sent immediately and repeated until the vehicle
+        confirms it (``FlightState.EMERGENCY``). After 8 s it is abandoned with an event (``vehicle_message``, reason
+        ``stop_given_up``). Until then, this connection sends nothing else: :meth:`velocity`, :meth:`hover` and similar
+        methods return False; :meth:`takeoff` and :meth:`land` raise :class:`RefusedError`. A program with several
+        connections must stop sending on the others itself. A stop not sent within 2 s is dropped.
 
         Returns:
-            False if the link is down and the stop can't be sent now.
+            False if the link is down and the stop can't be sent immediately.
 
         Raises:
-            AuthorityError: If this application only observes.
-            UnsupportedError: If the vehicle can't stop its motors, or has no commands.
+            AuthorityError: If this application is only an observer.
+            UnsupportedError: If the vehicle can't stop its motors, or accepts no commands.
             ClosedError: If the drone was closed.
         """
         return self._commands.command(EmergencyStop())
@@ -621,7 +619,7 @@ class Drone:
     def reset_emergency(self) -> bool:
         """Leave the emergency state while on the ground.
 
-        If the vehicle has not yet reported this application's stop, the reset is sent as soon as it has, within 2 s.
+        If the vehicle has not yet confirmed this application's stop, the reset is sent once it has, within 2 s.
         """
         return self._commands.command(ResetEmergency())
 
@@ -634,24 +632,24 @@ class Drone:
         position_std_m: float | None = None,
         attitude_std_rad: float | None = None,
     ) -> bool:
-        """Send the vehicle its own pose as measured from outside, for an autopilot that navigates by it instead of GPS.
+        """Send the vehicle its own externally measured pose, for an autopilot that uses it instead of GPS.
 
-        Thread-safe. Returns at once, without requiring the authority. Refusals cause events (``command_refused``).
+        Thread-safe; returns immediately. Requires no authority. Refusals cause events (``command_refused``).
 
         Args:
-            position: x east, y north, z up [m].
-            quaternion: x, y, z, w of the rotation from body axes (x forward, y left, z up) to world axes.
+            position: Position [m]: x east, y north, z up.
+            quaternion: Rotation from body axes (x forward, y left, z up) to world axes, as x, y, z, w.
             at_ns: Time of the measurement, on the proxy's clock [ns]; None: now.
             position_std_m: Standard deviation of the position [m], if known.
             attitude_std_rad: Standard deviation of the attitude [rad], if known.
 
         Returns:
-            True if it was handed to the transport.
+            True if the pose was handed to the transport.
 
         Raises:
             AuthorityError: If this application only observes.
-            UsageError: If a number is missing or not finite, a standard deviation is negative, the quaternion's length
-                differs from 1 by more than 0.001, or ``at_ns`` is out of range.
+            UsageError: If a number is missing or not finite, if a standard deviation is negative, if the quaternion's
+                length differs from 1 by more than 0.001, or if ``at_ns`` is out of range.
         """
         if self._commands.role is not Role.PILOT:
             text = 'send_external_pose: this application only observes; connect with access="pilot"'
@@ -666,15 +664,15 @@ class Drone:
     def feedback(self, *, max_age_s: float | None = None, max_hz: float | None = None) -> Feedback:
         """Return the newest feedback.
 
-        An observer receives only as much data as its consumers need, and every sample as long as none of them limits
-        its request; the first call of this method adds a permanent consumer. A pilot always receives everything.
+        An observer receives only as much data as its consumers need; if any of them sets no limit, it receives every
+        sample. The first call of this method adds a permanent consumer. A pilot always receives everything.
 
         Args:
-            max_age_s: Maximum age since capture [s]; None: any.
-            max_hz: Maximum rate of new samples that is needed, 0.001 to 1000 Hz; None: all.
+            max_age_s: Maximum age since capture [s]; None: no limit.
+            max_hz: Maximum rate of new samples, 0.001 to 1000 Hz; None: no limit.
 
         Raises:
-            NoAnswerError: If there is no feedback yet, or the newest is older than ``max_age_s``.
+            NoAnswerError: If there is no feedback yet, or if the newest sample is older than ``max_age_s``.
             ClosedError: If the drone was closed.
             UsageError: If ``max_hz`` is out of range.
         """
@@ -691,18 +689,18 @@ class Drone:
         return newest
 
     def overview(self, timeout_s: float = 2.0) -> Overview:
-        """Return the newest overview of all vehicles in the proxy's process, with one row per vehicle.
+        """Return the newest overview of all vehicles in the proxy's process, which has one row per vehicle.
 
-        Overviews are sent once a second and are much smaller than feedback, so they suit applications that watch many
-        vehicles. The first call subscribes permanently and waits for the first overview.
+        Overviews arrive once a second and are much smaller than feedback, and therefore suit applications that watch
+        many vehicles. The first call subscribes permanently and waits for the first overview.
 
         Args:
             timeout_s: How long to wait for the first overview [s].
 
         Raises:
-            NoAnswerError: If none arrives in time, for example from an older proxy.
+            NoAnswerError: If no overview arrives in time, for example because the proxy is too old to send one.
             ClosedError: If the drone is closed.
-            UsageError: If called from an inline callback before the first one has arrived.
+            UsageError: If called from an inline callback before the first overview has arrived.
         """
         self._connection.check_open()
         state = self._state
@@ -717,18 +715,18 @@ class Drone:
         return state.overview
 
     def age_s(self, sample: Feedback | Frame) -> float:
-        """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
+        """Return the time since a sample was captured [s]; the maximum error is ``clock_uncertainty_ns``."""
         return (self.now_ns - sample.captured_ns) / 1e9
 
     def next_feedback(self, timeout_s: float = 1.0, *, max_hz: float | None = None) -> Feedback:
-        """Wait for feedback that has not been read yet, and return the newest.
+        """Wait for feedback that has not been read yet, and return the newest sample.
 
         Args:
             timeout_s: How long to wait [s].
-            max_hz: As for :meth:`feedback`; samples requested by other consumers may be returned, too.
+            max_hz: As for :meth:`feedback`; may also return samples that other consumers requested.
 
         Raises:
-            NoAnswerError: If none arrives in time.
+            NoAnswerError: If no feedback arrives in time.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback, or an option is out of range.
         """
@@ -747,11 +745,11 @@ class Drone:
         The first call subscribes to the camera permanently.
 
         Args:
-            camera: Name of the camera; None: the vehicle's first.
+            camera: Name of the camera; None: the vehicle's first camera.
             max_age_s: Maximum age since capture [s]; None: any.
 
         Returns:
-            The frame; None if none has arrived yet, it is too old, or it can't be decoded.
+            The frame; None if no frame has arrived yet, or if it is too old or can't be decoded.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
@@ -782,7 +780,7 @@ class Drone:
             UsageError: If called from an inline callback.
         """
         deadline = time.monotonic() + timeout_s
-        waited_s = 0.0  # in a stepped replay the time waited for passes at once
+        waited_s = 0.0  # a stepped replay skips the waiting time at once
         while True:
             # Look up the channel each time, because the proxy may have restarted with a different camera.
             channel = self._state.video.channel(camera)
@@ -803,17 +801,17 @@ class Drone:
     ) -> Iterator[Frame]:
         """Yield the newest frame repeatedly until the drone is closed; a slow loop skips frames.
 
-        The first iteration raises the errors, not the call itself.
+        The first iteration raises the errors; the call itself does not.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
-            **how: ``max_fps``: maximum frames per second. ``scale``: factor for width and height, above 0 and up to 1.
-                ``part``: (k, n), only every n-th frame, so that n workers, numbered by k from 0, can share the frames.
-                ``encoding``: how frames are sent over a network: ``"jpeg"`` (with ``quality`` 1 to 100, default 80),
-                ``"h264"`` (at ``kbit_s`` kilobits a second; by default at the rate that the network path can carry,
-                with smaller and fewer frames if that is low) or ``"raw"``; within one host, all frames are raw.
-                ``max_age_s``: frames older than this when their turn comes are skipped and counted as dropped.
+            **how: ``max_fps``: maximum number of frames per second. ``scale``: factor for width and height, above 0, at
+                most 1. ``part``: (k, n) for only every n-th frame, which lets n workers, numbered by k from 0, share
+                the frames. ``encoding``: how frames are sent over a network: ``"jpeg"`` (``quality`` 1 to 100, default
+                80), ``"h264"`` (``kbit_s`` kilobits per second; by default the rate that the network path can carry,
+                with smaller and fewer frames if that rate is low) or ``"raw"``; within one host, all frames are raw.
+                ``max_age_s``: frames older than this on delivery are skipped and counted as dropped.
 
         Raises:
             NoAnswerError: If no frame arrives within ``timeout_s``.
@@ -841,15 +839,15 @@ class Drone:
         """Wait until the newest feedback meets a condition.
 
         Args:
-            state: A flight state or its name, several of them, or a predicate on feedback, which runs on this thread.
+            state: A flight state or its name, several of them, or a function that tests feedback on this thread.
             timeout_s: How long to wait [s].
 
         Returns:
             The feedback that met the condition.
 
         Raises:
-            NoAnswerError: If it is not met in time; the message gives the current state.
-            UnknownNameError: If there is no flight state of this name.
+            NoAnswerError: If no feedback meets it in time; the message gives the current state.
+            UnknownNameError: If no flight state has this name.
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
@@ -881,13 +879,13 @@ class Drone:
     ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 
-        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends the calls. It raises
-        :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
+        Like every ``on_...`` method, it returns a :class:`Listener`; the listener's ``cancel()`` ends the calls. It
+        raises :class:`UsageError` if ``function`` is not callable and :class:`ClosedError` if the drone was closed.
 
         Args:
-            function: Called in its own thread; feedback replaced by newer feedback is dropped and counted.
-            inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
-            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: all. An observer does not receive more than that
+            function: Called in its own thread; samples replaced by newer ones are dropped and counted.
+            inline: Whether to call it on the receiving thread instead, with every sample. It must not wait.
+            max_hz: Maximum rate of samples, 0.001 to 1000 Hz; None: no limit. An observer receives no more than that
                 unless another consumer requests more.
         """
         channel = self._state.feedback_channel(_feedback_request(max_hz))
@@ -904,32 +902,32 @@ class Drone:
         """Call ``function`` with each event, including the client's own (number 0).
 
         Args:
-            function: Called in its own thread; up to 256 events wait for it.
-            inline: Call it on the receiving thread instead. For the client's own events, this is the thread that emits
-                them.
+            function: Called in its own thread; at most 256 events wait for it.
+            inline: Whether to call it on the receiving thread instead. The client's own events are then delivered on
+                the thread that emits them.
         """
         return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
 
     def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
-        """Call ``function`` in its own thread whenever one of the hops changes state; up to 256 changes may wait."""
+        """Call ``function`` in its own thread whenever one of the two links changes state; up to 256 changes wait."""
         return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
 
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
         """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
-        It is called in its own thread or, with ``inline``, on the receiving one.
+        It is called in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
-        """Call ``function`` with the annotations that applications draw on frames; up to 256 of them may wait.
+        """Call ``function`` with the annotations that applications draw on frames; up to 256 annotations may wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
-        """Call ``function`` with the log entries (``drone.log``) of all applications, also this one; up to 256 wait.
+        """Call ``function`` with all applications' log entries (``drone.log``), including our own; up to 256 wait.
 
         It is called in its own thread or, with ``inline``, on the receiving one.
         """
@@ -947,10 +945,10 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest unseen frames, at most ``depth`` of them.
-            camera: Name of the camera; None: the vehicle's first, even if the proxy restarts with other cameras.
+            function: Called in its own thread with the newest frames it has not seen; at most ``depth`` frames wait.
+            camera: Name of the camera; None: the vehicle's first camera, whichever it is after a restart.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
-            inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
+            inline: Whether to call it on the receiving thread instead, with every frame. It must be quick and not wait.
             **how: As for :meth:`frames`.
 
         Raises:
@@ -985,18 +983,18 @@ class Drone:
     ) -> Listener[EncodedFrame]:
         """Call ``function`` with a camera's encoded frames, to store or forward them.
 
-        Each is an H.264 access unit in Annex B format that can be decoded after its predecessors; the first one is a
-        key frame. After a loss, a key frame is requested from the proxy and delivered next. Without ``kbit_s``,
-        ``max_fps`` and ``scale``, frames arrive as encoded by the vehicle or, if it doesn't send H.264, by the proxy at
-        the rate that the network path can carry.
+        Each frame is an H.264 access unit in Annex B format that can be decoded after its predecessors. The first one
+        is a key frame. After a loss, the client requests a key frame from the proxy and delivers it next. Without
+        ``kbit_s``, ``max_fps`` and ``scale``, frames arrive as the vehicle encoded them. If the vehicle doesn't send
+        H.264, the proxy encodes them at the rate that the network path can carry.
 
         Args:
             function: Called in its own thread.
             camera: Name of the camera; None: the vehicle's first.
-            kbit_s: Rate at which the proxy encodes [kbit/s], once for all clients with the same request.
-            max_fps: Maximum number of frames per second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            depth: How many frames may wait, at least 1; if there are more, some are lost.
+            kbit_s: Bit rate at which the proxy encodes [kbit/s]; clients with the same request share one encoder.
+            max_fps: Maximum number of frames per second; None: no limit.
+            scale: Factor for width and height, greater than 0 and at most 1.
+            depth: How many frames may wait, at least 1; any further frames are lost.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -1030,13 +1028,13 @@ class Drone:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.
 
         Args:
-            frame: The frame that the shapes belong to.
-            shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
-            source: Name of the component that drew them; None: this application. For each source and camera, new shapes
-                replace earlier ones.
+            frame: The frame on which the shapes are drawn.
+            shapes: Shapes in pixels of this frame; coordinates may be NumPy numbers.
+            source: Name of the component that drew the shapes; None: this application. For each source and camera, new
+                shapes replace the earlier ones.
 
         Returns:
-            True if they were handed to the transport.
+            True if the shapes were handed to the transport.
 
         Raises:
             UsageError: If an item is not a shape, there are too many, coordinates are not finite, or colours are not
@@ -1052,7 +1050,7 @@ class Drone:
         return self._connection.transmit(packet)
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
-        """Emit an event (number 0) to this application's own callbacks only.
+        """Emit an event (number 0), only to this application's own callbacks.
 
         Args:
             kind: Kind of the event.
@@ -1071,10 +1069,10 @@ class Drone:
 
         Args:
             processor: Name of the processor.
-            max_age_s: Maximum age since the frame's capture [s]; None: any.
+            max_age_s: Maximum age since the frame's capture [s]; None: no limit.
 
         Returns:
-            The result; None if none has arrived yet or it is too old.
+            The result; None if no result has arrived yet or the newest one is too old.
 
         Raises:
             UsageError: If ``processor`` is not a valid name or ``max_age_s`` is negative.
@@ -1089,8 +1087,8 @@ class Drone:
     def results(self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0) -> Iterator[Result]:
         """Yield a processor's newest result repeatedly until the drone is closed.
 
-        A slow loop skips results; :attr:`stats` counts them, as well as those that are too old. Errors are raised by
-        the first iteration, not by the call.
+        A slow loop skips results; :attr:`stats` counts them and results that are too old. The first iteration raises
+        the errors, not the call itself.
 
         Args:
             processor: Name of the processor.
@@ -1098,8 +1096,8 @@ class Drone:
             timeout_s: How long to wait for each result [s].
 
         Raises:
-            NoAnswerError: If no sufficiently new result arrives in time.
-            UsageError: If ``processor`` is invalid, ``max_age_s`` is negative, or if called from an inline callback.
+            NoAnswerError: If no result that is new enough arrives in time.
+            UsageError: If ``processor`` is invalid or ``max_age_s`` is negative, or if called from an inline callback.
             ClosedError: If the drone was already closed.
         """
         mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
@@ -1127,9 +1125,9 @@ class Drone:
         Args:
             function: Called in its own thread.
             processor: Name of the processor; None: all processors.
-            max_age_s: Maximum age [s]; results older than this when their turn comes are skipped and counted in the
-                listener's ``expired``. None: no limit.
-            depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
+            max_age_s: Maximum age [s]. Results that are older when they would be delivered are skipped and counted in
+                the listener's ``expired``. None: no limit.
+            depth: How many results may wait, at least 1; None: 1 for a single processor, 256 for all processors.
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
@@ -1150,13 +1148,13 @@ class Drone:
     # The end ---------------------------------------------------------------------------------------------------
 
     def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
-        """Run the pre-flight checklist; each finding comes with a reason and a remedy.
+        """Run the pre-flight checklist; each problem found has a reason and a remedy.
 
-        Reads the proxy's parameters and requests an image from each camera. Doesn't fly and needs no authority.
+        Reads the proxy's parameters and requests one image from each camera. Neither flies nor requires the authority.
 
         Args:
-            video_s: Total time to wait for frames [s]; 0: don't check cameras.
-            folder: Folder for recordings, to check its free space; None: don't check.
+            video_s: Total time to wait for frames [s]; 0 skips the camera check.
+            folder: Folder for recordings, whose free space is checked; None skips this check.
 
         Raises:
             ClosedError: If the drone is closed.
@@ -1172,9 +1170,9 @@ class Drone:
             return inspect(self, state.newest, video_s, folder)
 
     def close(self) -> None:
-        """Release the authority, then end the connection, all threads and a private proxy.
+        """Release the authority, then end the connection, all threads and the private proxy, if any.
 
-        Does not land, but a private proxy lands a flying vehicle before it ends. Idempotent. Threads that wait for this
+        Does not land, but a private proxy lands a flying vehicle before it ends. Idempotent. Threads that wait on this
         drone get :class:`ClosedError`.
         """
         if self.closed:
@@ -1186,13 +1184,13 @@ class Drone:
             if self._connection.connected:
                 self._commands.release(wait=not self._connection.receiving)
         except LinkError:
-            pass  # the link is already lost, and with it the authority
+            pass  # the link is already lost, and the authority with it
         finally:
             self._supervisor.close()
             listeners = list(self._state.listeners)
             for listener in listeners:
                 listener.cancel(wait=False)
-            deadline_s = time.monotonic() + JOIN_S  # the time limit is shared by all of them
+            deadline_s = time.monotonic() + JOIN_S  # all of them share the time limit
             for listener in listeners:
                 listener.join(max(0.0, deadline_s - time.monotonic()))
             for close in list(self._state.to_close):
@@ -1255,7 +1253,7 @@ def open_drone(
 ) -> Drone:
     """Connect through a dialer, and reconnect after each loss; applications call :func:`skyloop.connect`.
 
-    ``app``: the application's name, 1 to 64 characters. For the rest, see :func:`connect` and :class:`DroneOptions`.
+    ``app``: the application's name, 1 to 64 characters. See :func:`connect` and :class:`DroneOptions` for the rest.
     """
     drone = Drone(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, authority=authority)
@@ -1267,14 +1265,14 @@ def _feedback_request(max_hz: float | None) -> FeedbackRequest:
 
 
 def _from_numpy(value: Any) -> Any:
-    """Convert NumPy's scalars and arrays to plain numbers and lists."""
+    """Convert NumPy scalars and arrays to plain numbers and lists."""
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
 
 
 def _delay(statistics: Statistics | None) -> Distribution | None:
-    """Return the proxy's measured delay from sending to applying; None if there is none."""
+    """Return the delay from sending to applying that the proxy measured; None if there is no measurement."""
     counters = {} if statistics is None else statistics.counters
     count = int(counters.get("commands.delay.count", 0))
     if not count:

@@ -1,4 +1,4 @@
-"""Frames for applications: NumPy arrays that know their camera, times and the vehicle's state at capture."""
+"""Frames for applications: NumPy arrays with their camera, their times, and the vehicle's state at capture."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ else:
     _Base = np.ndarray
 
 HISTORY_DEPTH: Final = 256  #: number of feedback samples kept: 8 s at 32 Hz
-_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display images at once and rarely keep them
+_PNG_LEVEL: Final = 1  #: fastest compression: notebooks display images immediately and rarely keep them
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
 )
-_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: names that other libraries give to the image
+_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: names other libraries use for the image
 
 
 class Frame(_Base):
     """An image as a read-only BGR array of shape (height, width, 3) and dtype uint8; draw on ``frame.copy()``.
 
-    It is a NumPy array, so NumPy and OpenCV accept it directly. Where a plain array is needed, ``numpy.asarray(frame)``
-    gives the same memory without the attributes below. Where possible, it is the transport's memory itself, not a
-    copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times [ns]
-    are ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on ours.
+    It is a NumPy array, so NumPy and OpenCV accept it directly. Where a plain array is required,
+    ``numpy.asarray(frame)`` returns the same memory without the attributes below. Where possible, the frame uses the
+    transport's memory directly, without a copy. Slices, copies and results of arithmetic are plain arrays or lack the
+    attributes below. Times [ns] are ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock,
+    ``received_ns`` on this host's.
     """
 
     _arrival: Arrival
@@ -73,12 +74,12 @@ class Frame(_Base):
 
     @property
     def published_ns(self) -> int:
-        """When the proxy received the frame, on its clock [ns]."""
+        """Time at which the proxy received the frame, on the proxy's clock [ns]."""
         return self._arrival.header.published_ns
 
     @property
     def received_ns(self) -> int:
-        """When this process received the frame, on this host's clock [ns]."""
+        """Time at which this process received the frame, on this host's clock [ns]."""
         return self._arrival.received_ns
 
     @property
@@ -95,7 +96,7 @@ class Frame(_Base):
     def feedback(self) -> Feedback | None:
         """The vehicle's state at the time of capture, interpolated between the samples before and after it.
 
-        Until the later one arrives, this is the earlier one unchanged; see :attr:`feedback_reach_s`. None if unknown.
+        Until the later sample arrives, the earlier one is used unchanged (:attr:`feedback_reach_s`). None if unknown.
         """
         return self._arrival.state_at_capture()[0]
 
@@ -105,7 +106,7 @@ class Frame(_Base):
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
-        """Return a writable plain array with the same pixels, to draw on; ``order`` as for :func:`numpy.copy`."""
+        """Return a writable plain array with the same pixels, for drawing; ``order`` is that of :func:`numpy.copy`."""
         return self.view(np.ndarray).copy(order)
 
     def _repr_png_(self) -> bytes | None:
@@ -122,7 +123,7 @@ class Frame(_Base):
             raise AttributeError(
                 f"this array was derived from a frame and has no {name}: only the delivered frame has it"
             )
-        if name in _THE_IMAGE:  # without ``obj``, Python doesn't append a guess ("imag")
+        if name in _THE_IMAGE:  # without ``obj``, Python doesn't append a wrong suggestion ("imag")
             raise AttributeError(f"a frame has no {name}: it is the image itself, a NumPy array", name=name)
         raise AttributeError(f"a frame has no attribute {name!r}")
 
@@ -133,7 +134,7 @@ def png(image: NDArray[Any]) -> bytes | None:
     if image.dtype != np.uint8 or not image.size or not (grey or (image.ndim == 3 and image.shape[2] == 3)):
         return None
     height, width = image.shape[:2]
-    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each row starts with its filter type: none
+    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each row begins with its filter type: none
     rows[:, 1:] = (image if grey else image[:, :, ::-1]).reshape(height, -1)
     head = struct.pack(">IIBBBBB", width, height, 8, 0 if grey else 2, 0, 0, 0)
     parts = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), _PNG_LEVEL)), (b"IEND", b""))
@@ -144,7 +145,7 @@ def png(image: NDArray[Any]) -> bytes | None:
 
 
 class Arrival:
-    """A received frame. The first consumer that needs the image decodes it in its own thread, on behalf of all."""
+    """A received frame. The first consumer that needs the image decodes it for all consumers, in its own thread."""
 
     __slots__ = (
         "_clock",
@@ -172,8 +173,8 @@ class Arrival:
     ) -> None:
         """Store a frame received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
-        ``history`` provides the state at the time of capture. When a frame larger than its consumer
-        requested is decoded, its width and height are multiplied by ``scale``.
+        ``history`` provides the vehicle's state at the time of capture. If a frame is larger than its consumer
+        requested, decoding multiplies its width and height by ``scale``.
         """
         self.header = self._full = header
         if scale != 1.0:
@@ -196,7 +197,7 @@ class Arrival:
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
     def as_came(self) -> Pixels | None:
-        """Return the bytes as received, shape (size,); None once the image is decoded, or if it is scaled down."""
+        """Return the bytes as received, shape (size,); None once the image has been decoded or if it is scaled down."""
         with self._lock:
             return self._pixels if self._full is self.header else None
 
@@ -214,13 +215,13 @@ class Arrival:
                 self._pixels = None
             frame = self._image.view(Frame)
             frame._arrival = self
-            self._frame = weakref.ref(frame)  # weak, to avoid a reference cycle: the frame refers to this object
+            self._frame = weakref.ref(frame)  # a weak reference avoids a cycle: the frame refers to this object
             return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
-        """Return the vehicle's state at the time of capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
+        """Return the vehicle's state at the time of capture, and its reach [s] (see :attr:`Frame.feedback_reach_s`).
 
-        The look-up is repeated until there is a sample on each side of the capture.
+        The look-up is repeated until there is a sample before and a sample after the capture.
         """
         if self._state is not None:
             return self._state
@@ -231,9 +232,9 @@ class Arrival:
 
 
 def compressed(frame: Frame, quality: int = 95) -> Arrival:
-    """Return a frame compressed as a JPEG, for storing many of them; :meth:`Arrival.frame` decodes it.
+    """Return a frame compressed as a JPEG, for storing many frames; :meth:`Arrival.frame` decodes it.
 
-    Raises :class:`MissingExtraError` if OpenCV is not installed, and :class:`LinkError` if encoding fails.
+    Raises :class:`MissingExtraError` if OpenCV is not installed, or :class:`LinkError` if encoding fails.
     """
     from_ = frame._arrival
     plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
@@ -244,10 +245,10 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
-    """Convert a frame's bytes to BGR, shape (height, width, 3), uint8, without a copy if they are BGR.
+    """Convert a frame's bytes to BGR, shape (height, width, 3), uint8; bytes that are already BGR are not copied.
 
-    Raises :class:`DecodeError` if they are not a JPEG of the size in the header, and :class:`MissingExtraError` if they
-    are one and OpenCV is not installed.
+    Raises :class:`DecodeError` if the bytes are not a JPEG of the size in the header, and :class:`MissingExtraError` if
+    they are a JPEG and OpenCV is not installed.
     """
     height, width = header.height, header.width
     encoding = header.encoding
@@ -276,23 +277,23 @@ def _decode_jpeg(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
 
 
 class FeedbackHistory:
-    """The newest samples of feedback, ordered by capture time. One thread adds; any thread may read."""
+    """The newest feedback samples, ordered by capture time. One thread adds samples; any thread may read."""
 
     def __init__(self, depth: int = HISTORY_DEPTH) -> None:
         self._samples: deque[Feedback] = deque(maxlen=depth)
 
     def add(self, sample: Feedback) -> None:
-        """Add a sample; if it is older than the newest (the proxy was restarted), start the history over."""
+        """Add a sample; if it is older than the newest (because the proxy was restarted), start a new history."""
         samples = self._samples
         if samples and sample.captured_ns < samples[-1].captured_ns:
             samples.clear()
         samples.append(sample)
 
     def at(self, captured_ns: int) -> tuple[Feedback | None, float | None, bool]:
-        """Return the state at a time on the proxy's clock, its reach [s], and whether there was a sample on each side.
+        """Return the state at a time on the proxy's clock, its reach [s], and whether samples exist on both sides.
 
-        The reach is the time from ``captured_ns`` to the more distant of the samples used. With samples on one side
-        only, the state is the nearest sample unchanged; without any, state and reach are None.
+        The reach is the time from ``captured_ns`` to the farther of the samples used. If samples exist on only one
+        side, the state is the nearest sample unchanged; without any samples, state and reach are None.
         """
         samples = list(self._samples)
         if not samples:
@@ -309,9 +310,9 @@ class FeedbackHistory:
 
 
 def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
-    """Interpolate the state at a time linearly between two samples, with angles taking the shorter way round.
+    """Interpolate the state at a time linearly between two samples; angles turn the shorter way round.
 
-    Fields that only one of the two has, or that can't be interpolated (states, names), are taken from the nearer one.
+    Fields that only one sample has, or that can't be interpolated (states, names), are taken from the nearer sample.
     """
     share = (captured_ns - a.captured_ns) / (b.captured_ns - a.captured_ns)
     nearer = a if share < 0.5 else b
@@ -340,7 +341,7 @@ def _number(a: float | None, b: float | None, share: float) -> float | None:
 def _angle(a: float | None, b: float | None, share: float) -> float | None:
     if a is None or b is None:
         return a if share < 0.5 else b
-    turn = math.remainder(b - a, math.tau)  # within [-π, π], so the shorter way round
+    turn = math.remainder(b - a, math.tau)  # within [-π, π], which is the shorter way round
     return math.remainder(a + turn * share, math.tau)
 
 

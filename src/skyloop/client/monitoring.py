@@ -1,4 +1,4 @@
-"""Evaluate a connection from the arrival times of packets: the link to the proxy, its clock, statistics. Pure."""
+"""Evaluate a connection from the arrival times of packets: its link, its clock offset and its statistics. Pure."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds
 from skyloop.messages import LinkState
 
-#: Maximum relative drift between two clocks: quartz is accurate to 50 ppm, time services correct its rate by up to as
-#: much again, and the two clocks may deviate in opposite directions.
+#: Maximum relative drift between two clocks. Quartz is accurate to 50 ppm, time services correct its rate by up to the
+#: same amount, and the two clocks may deviate in opposite directions.
 MAX_DRIFT: Final = 200e-6
 DEPTH: Final = 1024  #: number of samples stored per channel, a power of two
 
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """Thresholds for a link to count as degraded or as lost."""
+    """Thresholds at which a link counts as degraded or lost."""
 
     late_s: float = 0.3  #: time without feedback after which the link counts as degraded
-    silent_s: float = 1.0  #: time without any packet before the link is lost and reconnected
-    missing_share: float = 0.1  #: fraction of missing or malformed samples in the last window that degrades the link
+    silent_s: float = 1.0  #: time without any packet after which the link is reconnected
+    missing_share: float = 0.1  #: fraction of missing or malformed samples in a window that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: malformed packets in a window at which the link counts as lost and is reconnected
+    malformed: int = 5  #: number of malformed packets in a window at which the link is reconnected
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,28 +36,28 @@ class Verdict:
 
     state: LinkState
     reason: str
-    restart: bool = False  #: the connection should be closed and re-established
+    restart: bool = False  #: whether to close the connection and establish a new one
 
 
-_Counts = tuple[int, int, int]  #: at_ns, received, missing: a time and the totals at that time
+_Counts = tuple[int, int, int]  #: at_ns, received, missing: a time, and the totals at that time
 
-#: Maximum gap tolerated because of a low feedback rate [s]; links with even lower rates are checked by pings.
+#: Maximum gap tolerated because of a low feedback rate [s]; at lower rates, pings check the link.
 MAX_PATIENCE_S: Final = 2.0
-WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the fraction of missing ones
+WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the missing fraction
 
 
 class LinkMonitor:
     """Monitors one connection. :meth:`verdict` does the work; the other methods only set a few attributes.
 
-    Samples have consecutive numbers: a gap, less the samples that the proxy skipped to lower the rate, is a loss.
+    Samples are numbered consecutively. A gap counts as lost samples, minus those the proxy skipped to lower the rate.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
         self._limits = thresholds
-        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: time without data after which to ping
+        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: time without data before a ping
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
-        self._no_gaps_ns = 0  # gaps before this time may result from a changed request
+        self._no_gaps_ns = 0  # gaps before this time may be due to a changed request
         self.received_ns = now_ns  #: when the last valid packet arrived
         self.feedback_ns = 0  #: when feedback last arrived; 0 if never
         self.received = 0  #: number of feedback samples received
@@ -68,14 +68,14 @@ class LinkMonitor:
         self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
     def excuse(self, silence_s: float) -> None:
-        """Extend the time without data before the link counts as lost by this much [s], for networks with pauses."""
+        """Increase the time without data before the link counts as lost [s], for networks that pause."""
         self._limits = replace(self._limits, silent_s=self._limits.silent_s + silence_s)
         self._silent_ns += nanoseconds(silence_s)
 
     def expect(self, period_s: float, now_ns: int) -> None:
-        """Set the expected time between two feedback samples [s]; 0 if all of them are sent."""
+        """Set the expected time between two feedback samples [s]; 0 if the proxy sends all samples."""
         limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
-        # Switching loses no samples, but leaves a gap in the numbers, and the first new sample takes a while.
+        # A change of rate loses no samples, but it leaves a gap in the numbers, and the first new sample takes a while.
         self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
         self.received_ns = max(self.received_ns, now_ns)
         if self.feedback_ns:
@@ -86,9 +86,9 @@ class LinkMonitor:
         self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
 
     def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
-        """Record a feedback sample, before which the proxy skipped ``skipped`` samples.
+        """Record a feedback sample; ``skipped`` is the number of samples that the proxy skipped before it.
 
-        Returns False if it is a duplicate or arrived after a newer one.
+        Returns False if the sample is a duplicate or arrived after a newer one.
         """
         self.received_ns = now_ns
         last = self._last_seq
@@ -96,7 +96,7 @@ class LinkMonitor:
             if seq <= last:
                 return False
             gap = seq - last - 1
-            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy skipped as many before each missing one, too
+            if gap > skipped and now_ns >= self._no_gaps_ns:  # the proxy also skipped samples before each lost one
                 self.missing += -((skipped - gap) // (skipped + 1))
         self._last_seq = seq
         self.feedback_ns = now_ns
@@ -139,20 +139,20 @@ class LinkMonitor:
 
 
 class StallWatch:
-    """Detects that one channel has stalled while others deliver, so that it can be resubscribed.
+    """Detects that one channel has stalled while others still deliver, and should be resubscribed.
 
-    If all channels have been without data, the measurement starts over, because this channel may be the last to resume.
+    If all channels paused, the measurement starts again, because this channel may be the last to resume.
     """
 
     def __init__(self, patience_s: float, now_ns: int) -> None:
         """Start watching a channel, which counts as stalled after a silence of ``patience_s``."""
         self._patience_ns = nanoseconds(patience_s)
-        self.received_ns = now_ns  #: when this channel last delivered
+        self.received_ns = now_ns  #: time at which this channel last delivered
         self._asked_ns = now_ns
-        self._flow_ns = now_ns  # when the others last resumed delivering
+        self._flow_ns = now_ns  # time at which the others last resumed delivering
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
-        """Return whether to resubscribe now; True at most once every ``patience_s``."""
+        """Return whether to resubscribe now; returns True at most once every ``patience_s``."""
         if not others_flow:
             self._flow_ns = now_ns
         if now_ns - max(self.received_ns, self._asked_ns, self._flow_ns) <= self._patience_ns:
@@ -163,21 +163,21 @@ class StallWatch:
 
 @dataclass(frozen=True, slots=True)
 class Offset:
-    """The proxy's clock minus this process's clock, and its maximum error, both in ns."""
+    """The proxy's clock minus this process's clock, and the maximum error of this difference [ns]."""
 
     ns: int = 0
     uncertainty_ns: int = 0
 
 
-_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: a time on our clock, from which the two bounds widen
+_Trip = tuple[int, int, int]  #: sent_ns, low_ns, high_ns: a time on our clock, and the bounds at that time
 
 
 class OffsetEstimator:
     """Estimates the offset between two monotonic clocks from round trips.
 
-    The proxy wrote its answer between sending and receiving, which bounds the offset regardless of the delay in each
-    direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds from a round trip widen over time with
-    the possible drift of the clocks, and the true offset lies within the bounds of all round trips (Marzullo and
+    The proxy answered between the times of sending and receiving, which bounds the offset regardless of the delay in
+    each direction (Cristian, "Probabilistic clock synchronization", 1989). The bounds from a round trip widen over time
+    by the possible drift of the clocks, and the true offset lies within the bounds of all round trips (Marzullo and
     Owicki, "Maintaining the time in a distributed system", 1983).
     """
 
@@ -190,7 +190,7 @@ class OffsetEstimator:
         return len(self._trips)
 
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
-        """Add a round trip, answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
+        """Add a round trip that was answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
         self._trips.append((sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
@@ -203,7 +203,7 @@ class OffsetEstimator:
         for trip in reversed(self._trips):
             low, high = self._bounds(trip, now_ns)
             if max(low, low_ns) > min(high, high_ns):
-                break  # a clock was set or drifts too fast, so ignore older round trips
+                break  # a clock was set or drifts too fast: ignore older round trips
             low_ns, high_ns = max(low, low_ns), min(high, high_ns)
         return Offset((low_ns + high_ns) // 2, (high_ns - low_ns + 1) // 2)
 
@@ -230,14 +230,14 @@ class ChannelStats:
 
     count: int = 0  #: samples received; for commands, commands sent
     rate_hz: float = 0.0  #: samples per second, over the last two seconds
-    lost: int = 0  #: missing samples, according to gaps in their numbers; for video, including those the proxy skipped
-    #: Samples replaced by newer ones before their consumer took them; for commands, those the transport rejected.
+    lost: int = 0  #: missing samples, inferred from gaps in their numbers; for video, including those the proxy skipped
+    #: Samples replaced by newer ones before a consumer took them; for commands, those that the transport rejected.
     dropped: int = 0
     malformed: int = 0  #: undecodable samples
-    #: Time from publishing to receiving, over the last 1024 samples; for commands, from sending to applying.
+    #: Time from publishing to receiving, over the last 1024 samples; for commands, the time from sending to applying.
     delay_s: Distribution | None = None
     age_s: float | None = None  #: time since the newest sample's capture
-    uncertainty_s: float = 0.0  #: maximum error of both, from comparing two hosts' clocks; 0 on a single host
+    uncertainty_s: float = 0.0  #: maximum error of both, due to comparing two hosts' clocks; 0 on one host
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
@@ -256,7 +256,7 @@ def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
 
 
 class ChannelCounter:
-    """Counts the samples of one channel. One thread adds; any thread may read."""
+    """Counts the samples of one channel. One thread adds samples; any thread may read."""
 
     __slots__ = ("_arrivals", "_delays", "captured_ns", "count", "dropped", "last_seq", "lost", "malformed")
 
@@ -271,7 +271,7 @@ class ChannelCounter:
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """Count a sample that was captured and arrived at these times on this process's clock."""
+        """Count a sample that was captured and received at these times on this process's clock."""
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -288,7 +288,7 @@ class ChannelCounter:
     def stats(
         self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
     ) -> ChannelStats:
-        """Return the statistics at ``now_ns``, with the arguments added to the numbers counted here.
+        """Return the statistics at ``now_ns``, adding the arguments to the numbers counted here.
 
         ``ages``: whether ``age_s`` is meaningful for this channel.
         """

@@ -1,4 +1,4 @@
-"""Parameters of the vehicle and the proxy, as a mapping."""
+"""Access the parameters of the vehicle and the proxy as a mapping."""
 
 from __future__ import annotations
 
@@ -30,17 +30,18 @@ from skyloop.messages import (
 )
 
 ANSWER_S = 2.0
-MAX_TEXT = 4096  #: characters in a text value
+MAX_TEXT = 4096  #: maximum number of characters in a string value
 MAX_NUMBERS = 256
 _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusal.OBSERVER})
 
 
 class Restorer:
-    """Writes parameters again after a restart of the proxy, which has lost the values set by the application.
+    """Rewrites parameters after a restart of the proxy, which loses the values that the application set.
 
-    Rewrites only lasting values, never momentary parameters, and only if no other application can have written since:
-    losing the link changes nothing at the proxy, and other pilots' newer values are kept. A proxy numbers its leases
-    from 1, so a gap between two of ours means that another application held the authority and may have written.
+    Only lasting values are rewritten, never momentary parameters, and only if no other application can have written
+    since. A lost link changes nothing at the proxy, and newer values from other pilots are kept. A proxy numbers its
+    leases from 1. A gap between two of our leases means that another application held the authority and may have
+    written.
     """
 
     def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
@@ -49,23 +50,23 @@ class Restorer:
         self._lock = threading.Lock()
         self._written: dict[str, Value] = {}
         self._run_id = 0
-        self._lease = 0  # our last lease in this run of the proxy
-        self._missed = False  # whether the connection was lost after that lease, so that events may be missing
-        self._restore = False  # the proxy has restarted since the values were written
+        self._lease = 0  # this application's last lease in this run of the proxy
+        self._missed = False  # whether the connection was lost after that lease; events may be missing
+        self._restore = False  # whether the proxy has restarted since the values were written
 
     def written(self, parameter: Parameter) -> None:
-        """Record a value that the application has written."""
+        """Record a value written by this application."""
         if not parameter.momentary:
             with self._lock:
                 self._written[parameter.name] = parameter.value
 
     def overwritten(self, name: str) -> None:
-        """Record that another application has written this parameter."""
+        """Record that another application has written the parameter ``name``."""
         with self._lock:
             self._written.pop(name, None)
 
     def connected(self, run_id: int) -> None:
-        """Handle a new connection to the run of the proxy that has this number."""
+        """Handle a new connection to the proxy's run ``run_id``."""
         with self._lock:
             self._missed = True
             if run_id != self._run_id:
@@ -73,7 +74,7 @@ class Restorer:
                 self._run_id, self._lease = run_id, 0
 
     def granted(self, lease: int) -> None:
-        """Rewrite the values that a restarted proxy forgot, now that the authority is held. Does not wait."""
+        """After the authority is granted, rewrite the values that a restarted proxy has lost. Does not wait."""
         with self._lock:
             others, self._lease = self._missed and lease != self._lease + 1, lease
             restore, written = self._restore, dict(self._written)
@@ -101,12 +102,12 @@ class Restorer:
 
 
 class Config(Mapping[str, Value]):
-    """Parameters as a mapping from name to value; each access is a request to the proxy.
+    """Parameters as a mapping from name to value; each access sends a request to the proxy.
 
-    ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority. A
-    restarted proxy forgets written values; they are written again when the authority is next granted, unless another
-    application held it in between. Momentary parameters, such as a flip, are never rewritten. Every method waits for
-    the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing requires the authority.
+    A restarted proxy loses written values. They are written again when the authority is next granted, unless another
+    application held it in the meantime. Momentary parameters, such as a flip, are never rewritten. Every method waits
+    for the proxy's answer and raises :class:`NoAnswerError` if none arrives within 2 s.
     """
 
     def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:
@@ -115,18 +116,18 @@ class Config(Mapping[str, Value]):
         self._restorer = restorer
 
     def __getitem__(self, name: str) -> Value:
-        """Return the current value. Raises :class:`UnknownNameError`, with suggestions, for an unknown name."""
+        """Return the current value. Raises :class:`UnknownNameError`, with suggestions, if the name is unknown."""
         return self.describe(name).value
 
     def __setitem__(self, name: str, value: object) -> None:
         """Write one value.
 
         Raises:
-            ParameterError: If the proxy refuses it, with its reason.
-            AuthorityError: If the authority is not held.
-            UnknownNameError: If there is no such parameter; carries suggestions.
+            ParameterError: If the proxy refuses the value; the message gives the reason.
+            AuthorityError: If this application does not hold the authority.
+            UnknownNameError: If no parameter has this name; the error suggests similar names.
             UsageError: If no parameter can have a value of this type.
-            LinkError: If the link broke before the answer and the parameter is momentary: it may have been executed.
+            LinkError: If the link broke before the answer and the parameter is momentary; it may have been executed.
         """
         plain = plain_value(name, value)
         answer = self._call(
@@ -141,7 +142,7 @@ class Config(Mapping[str, Value]):
     def describe(self, name: str) -> Parameter:
         """Return a parameter's type, unit, range, default, value and description.
 
-        Raises :class:`UnknownNameError`, with suggestions, if there is no such parameter.
+        Raises :class:`UnknownNameError`, with suggestions, if no parameter has this name.
         """
         answer = self._call(name, lambda: GetParameter(_name(name)))
         if not isinstance(answer, ParameterValue):
@@ -170,7 +171,7 @@ class Config(Mapping[str, Value]):
         return any(parameter.name == name for parameter in self.parameters())
 
     def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  # one request for all names
-        """Return (name, value) of all parameters, sorted by name."""
+        """Return the (name, value) pairs of all parameters, sorted by name."""
         return [(parameter.name, parameter.value) for parameter in self.parameters()]
 
     def values(self) -> list[Value]:  # type: ignore[override]
@@ -199,9 +200,9 @@ def _name(name: object) -> str:
 
 
 def plain_value(name: str, value: object) -> Value:
-    """Return a value to send: a bool, int, float, str (up to 4096 characters) or tuple of up to 256 floats.
+    """Return a value that can be sent: a bool, int, float, str (up to 4096 characters) or tuple of up to 256 floats.
 
-    Lists and arrays of numbers and NumPy scalars are converted. Raises :class:`UsageError` for anything else.
+    Lists and arrays of numbers, and NumPy scalars, are converted. Raises :class:`UsageError` for any other type.
     """
     if isinstance(value, np.ndarray) and not value.ndim:
         value = value.item()

@@ -1,4 +1,4 @@
-"""How an application pilots its vehicle: waiting for commands to complete, giving up control, and ending the flight."""
+"""Pilot a vehicle for an application: wait for commands to complete, give up control, and end the flight."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from skyloop.messages import (
 from skyloop.messages.command import ENDINGS, SET_POINTS
 
 OnExit = Literal["land", "hover"]
-STOP_S: Final = 2.0  #: how long closing waits for the vehicle to report an emergency stop [s]
+STOP_S: Final = 2.0  #: how long closing waits for the vehicle to confirm an emergency stop [s]
 LANDING_S: Final = 20.0  #: how long to wait for a landing [s]
-OTHERS_S: Final = 1.0  #: time for feedback to show which application took a vehicle whose landing was refused [s]
+OTHERS_S: Final = 1.0  #: time for feedback to tell which application took a vehicle whose landing was refused [s]
 RETURN_S: Final = 180.0  #: how long to wait for a return flight that the proxy started [s]
 AGAIN_NS: Final = 500_000_000  #: interval between attempts at a take-off that is not possible yet [ns]
-#: If the proxy reports no outcome, feedback received sooner than this after a command may predate it [ns].
+#: If the proxy reports no outcome, feedback that arrives sooner than this after a command may predate the command [ns].
 _STALE_NS: Final = 100_000_000
 _NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -50,7 +50,7 @@ _log = logging.getLogger("skyloop")
 
 
 class Piloting:
-    """How one application pilots its vehicle until the end of the flight. Thread-safe."""
+    """Pilots the vehicle for one application until the end of the flight. Thread-safe."""
 
     def __init__(
         self,
@@ -93,15 +93,15 @@ class Piloting:
         *,
         automatic: bool = False,
     ) -> None:
-        """Send the command and, with ``wait``, wait until feedback shows that it is complete; see :meth:`Drone.land`.
+        """Send the command and, with ``wait``, wait until feedback confirms its completion; see :meth:`Drone.land`.
 
-        If a take-off is not complete in time, give up control of the vehicle. Do the same if the caller stops waiting,
-        for example after Ctrl-C, unless it was waiting for a landing.
+        If a take-off does not complete in time, give up control of the vehicle. Also give up control if the caller
+        stops waiting, for example after Ctrl-C, unless it was waiting for a landing.
         """
         if not wait:
             self.commands.command(action, now=True)
             return
-        if type(action) is not Land:  # a landing is commanded in any case, because nothing is safer
+        if type(action) is not Land:  # a landing is always commanded, because nothing is safer
             self._connection.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
         waiting = None
@@ -127,15 +127,16 @@ class Piloting:
             self.commands.bar()
             try:  # not a daemon: the interpreter must wait for the landing
                 threading.Thread(target=self.end_flight, name="skyloop-end").start()
-            except RuntimeError:  # no thread can be started, and this one may not wait
+            except RuntimeError:  # no thread can be started, and this thread must not wait
                 self.let_go(f"{where} ended the program", land=True)
 
     def let_go(self, reason: str, *, land: bool = False) -> bool:
-        """Hover or land by the library's own decision; this is the only place where it does so.
+        """Hover or land by the library's own decision; no other method does this.
 
-        Because no person decided this, the vehicle is left alone, here and by the proxy, if others are flying it, if it
-        is landing or returning, or if the application itself has landed or stopped it. A take-off without visible
-        effect is cancelled. If ``land`` is True, it lands instead of hovering. Returns whether anything was sent.
+        Because no person made this decision, the vehicle is left alone if other applications are flying it, if it is
+        landing or returning, or if this application has landed or stopped it. The proxy applies the same rule. A
+        take-off without visible effect is cancelled. With ``land``, it lands instead of hovering. Returns whether
+        anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -159,11 +160,11 @@ class Piloting:
     def end_flight(self, report: Callable[[str], object] = lambda _: None) -> SkyloopError | None:
         """End the flight: land or hover (see ``on_exit``) if this application flies the vehicle, then close.
 
-        As soon as this starts, commands from the application's other threads raise :class:`ClosedError`; only an
-        emergency stop is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
-        ``report`` is called with a text for each step. Returns the error, or None.
+        Once this starts, commands from the application's other threads raise :class:`ClosedError`; only an emergency
+        stop is still sent. Waits until the vehicle has landed. A second call waits for the first. Idempotent.
+        ``report`` is called with a message for each step. Returns the error, or None.
         """
-        if self.closed:  # also in a fork, where another thread may have held the locks
+        if self.closed:  # also in a forked child, where another thread may have held the locks
             return None
         self.commands.bar()
         with self._end:
@@ -176,12 +177,12 @@ class Piloting:
     def bring_down(
         self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
-        """If this application flies the vehicle, land and wait; otherwise let go of it. See :meth:`end_flight`."""
+        """If this application flies the vehicle, land and wait; otherwise give up control. See :meth:`end_flight`."""
         self.finish_stop()
         feedback = self._state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
-                if land and feedback.others and feedback.state not in _SINKING:  # we may have flown it until recently
+                if land and feedback.others and feedback.state not in _SINKING:  # we may just have flown it
                     _log.warning("%s: %s: it stays in the air, not landed from here", self._state.name, whose)
                 report(f"{whose}: leaving the drone to it")
             return None
@@ -199,13 +200,13 @@ class Piloting:
         except RefusedError as error:
             if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
                 return error
-            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that has just taken over
+            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that just took over
         except SkyloopError as error:
             return error
         return None
 
     def finish_stop(self) -> None:
-        """Wait up to 2 s until the vehicle reports an emergency stop, which closing would otherwise end too early."""
+        """Wait up to 2 s for the vehicle to confirm an emergency stop, because closing ends the stop."""
         if self._connection.connected and not self._connection.receiving:
             self._state.notifier.wait_for(lambda: not self.commands.schedule.stopping, STOP_S)
 
@@ -214,7 +215,7 @@ class Piloting:
         return self.closed or newest is None or newest.state in _ENDED_IN
 
     def _others_hands(self) -> str:
-        """Return who has taken over the vehicle from this application, as readable text; empty if no one has."""
+        """Return who has taken the vehicle from this application, as readable text; empty if nobody has."""
         status, newest = self.commands.status, self._state.newest
         if status.state in ("queued", "preempted"):
             return f"{status.holder or 'another application'} took over"
@@ -224,15 +225,15 @@ class Piloting:
         """Return whether this application is flying the vehicle or has just commanded a take-off."""
         newest = self._state.newest
         if self._state.status.vehicle is LinkState.CLOSED:
-            return False  # a recording that has ended has no vehicle to land
+            return False  # a recording that has ended has no vehicle that could land
         airborne = newest is not None and newest.state.airborne
         if newest is not None and newest.others:
-            return False  # others are also flying the vehicle, so we must not land or stop it
+            return False  # others are also flying the vehicle; this application must not land or stop it
         return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
 
 
 class ActionWait:
-    """Sends one action, and waits for feedback that shows its completion."""
+    """Sends one action and waits for feedback that confirms its completion."""
 
     def __init__(
         self,
@@ -252,31 +253,32 @@ class ActionWait:
         self._state = state
         self._connection = connection
         self._problem: Exception | None = None
-        self._why = ""  # why it was not done yet, as text
+        self._why = ""  # why the action was not complete yet, as text
         self._why_link: LinkState | None = None  # state of the vehicle's link at that time, which the text may mention
-        self._flew = False  # whether it has been in the air since
-        self._refused, self._refused_ns = 0, 0  # newest intent not possible yet, time of its first refusal
+        self._flew = False  # whether the vehicle has been in the air since
+        self._refused, self._refused_ns = 0, 0  # newest intent not possible yet, and when it was first refused
         self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle from its pilot at present, or at the time when the call can first be sent.
+        # The call may take the vehicle only from the pilot of this moment, or of the moment at which the action can
+        # first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = commands.ask(action, automatic=automatic)
 
     @property
     def outdone(self) -> bool:
-        """Whether the application has since commanded something else. A set-point after a take-off does not count."""
+        """Whether the application has since given a different command. A set-point after a take-off is ignored."""
         commands = self._commands
         behind = type(self._action) is Takeoff and isinstance(commands.newest, SET_POINTS)
         return commands.intent != self._intent and not behind
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
-        """Wait for the action until ``deadline_s`` on ``time.monotonic``; errors name ``timeout_s``.
+        """Wait for the action until ``deadline_s`` on ``time.monotonic``; error messages mention ``timeout_s``.
 
         Raises:
-            NoAnswerError: If it is not done in time.
+            NoAnswerError: If the action is not complete in time.
             ClosedError: If the drone is closed.
             AuthorityError: If another application takes over.
-            UnsupportedError: If the vehicle does not support it.
-            RefusedError: If the proxy refuses it in the present state, or it is ended by something else.
+            UnsupportedError: If the vehicle does not support the action.
+            RefusedError: If the proxy refuses the action in the current state, or something else ends it.
         """
         if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
             raise NoAnswerError(self._not_reached(timeout_s))
@@ -284,14 +286,14 @@ class ActionWait:
             raise self._problem
 
     def _over(self) -> bool:
-        """Return whether the action is done or there is no point in waiting any longer."""
-        if type(self._action) is Land and self._done():  # no matter who landed it
+        """Return whether the action is complete or waiting any longer is pointless."""
+        if type(self._action) is Land and self._done():  # regardless of who landed it
             return True
         self._problem = self._why_not()
         return self._problem is not None or self._done()
 
     def _done(self) -> bool:
-        """Return whether newer feedback shows that the action is done."""
+        """Return whether newer feedback confirms that the action is complete."""
         newest = self._state.newest
         if newest is None:
             return False
@@ -304,11 +306,11 @@ class ActionWait:
         if outcome.app_id != self._commands.app_id or outcome.intent < self._intent:
             return False
         if outcome.intent == self._intent and type(self._action) is Land and not self._flew:
-            return outcome.over  # the vehicle is already on the ground, but a take-off may still have been in transit
+            return outcome.over  # the vehicle is on the ground, but a take-off may still have been in transit
         return True
 
     def _why_not(self) -> Exception | None:
-        """Return why waiting any longer is pointless; None if it isn't. Repeats a request that may succeed later."""
+        """Return why waiting any longer is pointless; None if it is not. Repeats requests that may succeed later."""
         name = self._action.name
         if self._connection.why_closed or (self._commands.barred and not self._automatic):
             return ClosedError(f"this drone was closed during {name}")
@@ -319,8 +321,8 @@ class ActionWait:
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
         told = self._commands.told
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._note(told.text)  # the text is cleared once a repeat is executed
-            if not told.over:  # it was executed, so other holders took the vehicle after that
+            self._note(told.text)  # the text is cleared once the repeated request is executed
+            if not told.over:  # it was executed; any other holder took the vehicle afterwards
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -348,8 +350,8 @@ class ActionWait:
             now_ns, newest = self._state.scheduler.clock(), self._state.newest
             if self._refused != self._intent:
                 self._refused, self._refused_ns = self._intent, now_ns
-            # The withdrawn take-off first appears as a landing, which would end another take-off. A vehicle that is
-            # still starting up can only refuse, so the request is repeated afterwards.
+            # A withdrawn take-off first appears as a landing, which would end another take-off. A vehicle that is still
+            # starting up can only refuse the request, which is therefore repeated later.
             stands = newest is not None and not newest.state.airborne and not newest.waking_up
             if stands and now_ns - self._refused_ns >= AGAIN_NS and self._commands.may_ask:
                 self._again()
@@ -357,11 +359,11 @@ class ActionWait:
         if outcome.fate in OUTDONE:
             if self._called_off():
                 return _replaced(self._action)
-            return None  # a take-off in progress always comes to an end
+            return None  # a take-off in progress always ends
         if outcome.fate in OVERRULED:
             newest = self._state.newest
             rose = newest is not None and newest.state.airborne and newest.state is not FlightState.LANDING
-            if rose or not self._commands.may_ask:  # having left the ground, it will end up hovering
+            if rose or not self._commands.may_ask:  # the vehicle has left the ground and will end up hovering
                 return None
             text = f"takeoff was ended because {ENDINGS[outcome.fate]}: take off again"
             return RefusedError(text, code=Refusal.NOT_FRESH)
@@ -372,17 +374,18 @@ class ActionWait:
         commands, newest = self._commands, self._state.newest
         if commands.latest(Land, EmergencyStop, ResetEmergency) > self._intent:
             return True
-        # A hover or idle cancels a take-off without visible effect: if the vehicle is still on the ground, it is over.
+        # A hover or idle command cancels a take-off without visible effect: if the vehicle is still on the ground, the
+        # take-off is over.
         stayed, told = commands.latest(Hover, Idle), commands.told
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
-        """Return why waiting is pointless. Old commands aren't resent, but the caller still awaits this landing."""
+        """Return why waiting is pointless. Old commands aren't resent, but the caller still waits for this landing."""
         if outcome.fate in OVERRULED:
             if self._commands.may_ask:
-                # The caller still wants to land, but if a pilot has since taken over by hand, that pilot keeps the
-                # vehicle. A takeover is not visible while the application's own link is lost.
+                # The caller still wants to land. However, if a pilot has since taken over by hand, that pilot keeps the
+                # vehicle. While the application's own link is lost, it can't see a takeover.
                 taken = self._may_be_sent and self._others_now not in (None, self._others)
                 self._again(automatic=taken or outcome.fate not in (Fate.FAILSAFE, Fate.AUTHORITY))
             return None

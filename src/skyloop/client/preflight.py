@@ -1,4 +1,4 @@
-"""Pure checks before a flight, and :func:`inspect`, which collects a drone's state for them."""
+"""Check a drone before a flight with pure functions; :func:`inspect` collects the state they need."""
 
 from __future__ import annotations
 
@@ -25,29 +25,29 @@ STALE_S: Final = 1.0  #: maximum age for feedback to count as current [s]
 STALE_VIDEO_S: Final = 1.0
 CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
 LEVEL_RAD: Final = 0.12  #: maximum tilt at which a vehicle counts as level [rad]
-ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one at a time
+ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one camera at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
-FREE_BYTES: Final = 1_000_000_000  #: minimum free space of a disk for recordings
+FREE_BYTES: Final = 1_000_000_000  #: minimum free disk space for recordings
 FULL_BYTES: Final = 100_000_000
-FAR_M: Final = 10_000.0  #: a wall of the safety box at least this far away is ignored [m]
+FAR_M: Final = 10_000.0  #: a wall of the safety box is ignored if it is at least this far away [m]
 
 
 class Level(StrEnum):
     """How serious a finding is."""
 
     OK = "ok"
-    WARN = "warn"  #: it can fly, but lacks something helpful
-    FAIL = "fail"  #: it would not fly at all, or not safely
+    WARN = "warn"  #: the drone can fly, but lacks something helpful
+    FAIL = "fail"  #: the drone would not fly at all, or not safely
 
 
 @dataclass(frozen=True, slots=True)
 class PreflightFinding:
-    """One finding of the pre-flight checklist."""
+    """One finding from the pre-flight checklist."""
 
     check: str  #: the subject: ``link``, ``battery``, ``position`` and so on
     level: Level  #: how serious the finding is
     detail: str  #: the result
-    why: str = ""  #: why it matters; empty if all is well
+    why: str = ""  #: why it matters; empty if there is no problem
     remedy: str = ""  #: what to do about it; empty if there is nothing to do
 
 
@@ -61,16 +61,16 @@ class PreflightState:
     feedback_age_s: float | None = None
     #: Age of each camera's newest frame; None if none arrived in time.
     video_age_s: Mapping[str, float | None] = field(default_factory=dict)
-    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty if they were not read
-    clock_uncertainty_s: float = 0.0  #: uncertainty of all samples' ages
+    parameters: Mapping[str, Value] = field(default_factory=dict)  #: values by name; empty if not read
+    clock_uncertainty_s: float = 0.0  #: uncertainty of the ages of all samples
     app_id: int = 0  #: this application's number in this run of the proxy
-    free_bytes: int | None = None  #: free space on the disk for recordings [bytes]; None: not requested
+    free_bytes: int | None = None  #: free disk space for recordings [bytes]; None: not requested
     video_waited_s: float = 0.0  #: time spent waiting for frames
     name: str = "NAME"  #: the drone's name, used in the commands that remedies suggest
 
 
 class Inspected(Protocol):
-    """The part of a drone that the checks need."""
+    """The part of a drone that the checks use."""
 
     config: Config
 
@@ -97,7 +97,7 @@ def inspect(
     except ClosedError:
         raise
     except SkyloopError:
-        parameters = {}  # the link is not up, which is reported as a finding
+        parameters = {}  # the link is down, which is reported as a finding
     shown = shown_cameras(drone.capabilities, parameters)
     return check_before_flight(
         PreflightState(
@@ -117,7 +117,7 @@ def inspect(
 
 
 def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
-    """Return the age of a frame from each camera; None if none arrived in time. Waits only for cameras in ``shown``."""
+    """Return the age of one frame per camera; None if no frame arrived in time. Waits only for cameras in ``shown``."""
     deadline = time.monotonic() + timeout_s
     ages: dict[str, float | None] = {camera.name: None for camera in drone.capabilities.cameras}
     came = {name: threading.Event() for name in ages}
@@ -135,7 +135,7 @@ def _picture_ages(drone: Inspected, shown: Collection[str], timeout_s: float) ->
 
 
 def _free_bytes(folder: Path) -> int | None:
-    """Return the free bytes on the disk of an existing or future folder; None if unknown."""
+    """Return the free bytes on the disk of a folder, which need not exist yet; None if unknown."""
     there = folder.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -146,7 +146,7 @@ def _free_bytes(folder: Path) -> int | None:
 
 
 def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
-    """Return the checklist in reading order, including good findings."""
+    """Return the checklist in reading order, including findings without a problem."""
     found = [
         *_link(state),
         *_flight_state(state),
@@ -160,7 +160,7 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
-    # Drivers and the checks above give advice without the drone's name; with it, users can copy the commands.
+    # Drivers and the checks above give advice without the drone's name; adding it lets users copy the commands.
     return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
@@ -169,7 +169,7 @@ def _ok(check: str, detail: str) -> PreflightFinding:
 
 
 def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
-    """Return a finding at this level; at level OK, it has neither a reason nor a remedy."""
+    """Return a finding at this level; at level OK, the reason and the remedy are left empty."""
     return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 
@@ -360,7 +360,7 @@ def _video(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -> tuple[str, ...]:
-    """Return the cameras whose images a vehicle currently sends: all of them, or the selected one."""
+    """Return the cameras whose images a vehicle currently sends: all cameras, or the selected one."""
     names = tuple(camera.name for camera in capabilities.cameras)
     chosen = parameters.get(ACTIVE)
     return (chosen,) if isinstance(chosen, str) and chosen in names else names
@@ -408,7 +408,7 @@ def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
-    """Yield the findings of the vehicle's driver."""
+    """Yield the findings that the vehicle's driver reported."""
     text = state.parameters.get(CHECKUP)
     if not isinstance(text, str) or not text:
         return

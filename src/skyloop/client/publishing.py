@@ -1,4 +1,4 @@
-"""What an application publishes besides commands: its log, and its results as a processor's worker."""
+"""Publish what an application produces besides commands: its log, and its results as a processor's worker."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from skyloop.messages.relayed import MAX_CODE, MAX_LOG_TEXT, MAX_VALUES, pack
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
 
-RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; a worker counts as silent after one second
+RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; without renewal, a worker counts as silent after 1 s
 MAX_DIMENSIONS: Final = 8  #: maximum number of dimensions of an array in the log
 
 
 class Logbook:
-    """Publishes text, numbers and arrays. Thread-safe; no method waits.
+    """Publishes text, numbers and arrays. Thread-safe; no method blocks.
 
-    Each method returns whether all of it was handed to the transport, and raises :class:`UsageError` for values that
-    can't be logged. Names of series have 1 to 64 characters.
+    Each method returns whether everything was handed to the transport, and raises :class:`UsageError` for values that
+    can't be logged. Names of series must have 1 to 64 characters.
     """
 
     def __init__(self, connection: ProxyConnection, source: str) -> None:
@@ -54,7 +54,7 @@ class Logbook:
 
         Args:
             text: The text, at most 4096 characters.
-            name: Name of the series that it belongs to, if any.
+            name: Name of the series to which the line belongs, if any.
             severity: Severity of the entry, or its name.
         """
         if name != "":
@@ -127,8 +127,8 @@ def _finite(name: str, value: object) -> float:
 class Membership:
     """One worker of a processor; created by :func:`skyloop.extend.join_processor`.
 
-    It ends on :meth:`close` and when the drone is closed. The proxy forgets a worker when its connection ends; the
-    worker rejoins automatically after a reconnection.
+    It ends on :meth:`close` or when the drone is closed. The proxy forgets a worker when its connection ends; the
+    worker rejoins after a reconnection.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class Membership:
         *,
         shared: bool,
     ) -> None:
-        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, also after the proxy restarts."""
+        """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, even after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
             raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
@@ -150,13 +150,13 @@ class Membership:
         self._find = find
         self.code = code
         self.shared = shared
-        #: Called at each renewal; returns whether this worker can take frames; if not, the others get them.
+        #: Called at each renewal; returns whether this worker can take frames. If not, other workers get the frames.
         self.ready: Callable[[], bool] = lambda: True
-        #: This worker's newest share of the frames; None while unknown. Set on the receiving thread.
+        #: This worker's newest share of the frames; None while unknown. It is set on the receiving thread.
         self.share: ProcessorShare | None = None
-        #: Called on the receiving thread when this worker's part has changed.
+        #: Called on the receiving thread when this worker's share has changed.
         self.changed: Callable[[ProcessorShare], None] | None = None
-        self.refused: SkyloopError | None = None  #: why it is no longer a worker
+        self.refused: SkyloopError | None = None  #: why this application is no longer a worker
         self._connection = connection
         self._state = state
         self._wake = threading.Event()
@@ -165,11 +165,10 @@ class Membership:
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{processor}", daemon=True)
 
     def start(self, timeout_s: float) -> None:
-        """Join, and renew the membership from then on in a separate thread.
+        """Join the processor, then renew the membership in a separate thread.
 
         Raises :class:`NameTakenError` if another application runs other code under this name, :class:`RefusedError` if
-        the proxy refuses for another reason, and :class:`LinkError` if it does not answer in time or the drone is
-        closed.
+        the proxy refuses for another reason, and :class:`LinkError` if it doesn't answer or the drone is closed.
         """
         self._state.on_share.add(self._take_share, lambda: 0)
         self._state.on_welcome.add(self._take_welcome, lambda: 0)
@@ -184,11 +183,11 @@ class Membership:
         self._state.to_close.append(self.close)
 
     def renew(self) -> None:
-        """Renew at once, for example because :attr:`ready` has changed. Thread-safe."""
+        """Renew immediately, for example because :attr:`ready` has changed. Thread-safe."""
         self._wake.set()
 
     def publish(self, frame: Frame, value: Any, took_s: float = 0.0) -> bool:
-        """Publish the value found in a frame (see :func:`skyloop.messages.relayed.pack`) and the time it took [s].
+        """Publish the value found in a frame (see :func:`skyloop.messages.relayed.pack`) and the processing time [s].
 
         Returns whether the result was handed to the transport. Raises :class:`UsageError` if the value can't be sent.
         """
@@ -208,7 +207,7 @@ class Membership:
     def close(self) -> None:
         """Leave the group of workers. Idempotent.
 
-        The proxy gives its frames to the other workers once renewals stop, or at once when the drone is closed.
+        The proxy passes its frames to the other workers once renewals stop, or immediately when the drone is closed.
         """
         self._leave()
         self._ended = True
@@ -244,7 +243,7 @@ class Membership:
 
     def _welcomed(self, welcome: Welcome) -> None:  # noqa: ARG002  (signature of the topic's callbacks)
         self.share = None
-        with suppress(SkyloopError):  # there is no such camera, which the proxy's answer reports as well
+        with suppress(SkyloopError):  # there is no such camera; the proxy's answer reports this, too
             self.camera = self._find()
         self._wake.set()
 

@@ -1,4 +1,4 @@
-"""Results of processors: one channel per processor, and newest-wins mailboxes."""
+"""Receive the results of processors: one channel per processor, and newest-wins mailboxes."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from skyloop.transport.base import RESULTS, results
 
 T = TypeVar("T")
 _UNREAD: Final = object()
-MAX_CHANNELS: Final = 256  #: maximum number of processors remembered without a subscription
-MAX_WORKERS: Final = 1024  #: maximum number of workers per processor whose last numbers are remembered
+MAX_CHANNELS: Final = 256  #: maximum number of processors to remember without a subscription
+MAX_WORKERS: Final = 1024  #: maximum number of workers per processor whose last number is remembered
 
 
 class Result:
-    """A processor's result for one frame. Times are on the proxy's clock [ns], as for frames."""
+    """A processor's result for one frame. Times are on the proxy's clock [ns], like those of frames."""
 
     __slots__ = ("_clock", "_history", "_offset_ns", "_value", "header", "overtaken", "received_ns")
 
@@ -35,11 +35,11 @@ class Result:
     ) -> None:
         """Store a result received at ``received_ns`` on ``clock``; adding ``offset_ns`` gives the proxy's time.
 
-        ``history`` provides the state at the time of capture. The value is decoded on first access.
+        ``history`` provides the vehicle's state at the time of capture. The value is decoded on first access.
         """
-        self.header = header  #: the packet as received
+        self.header = header  #: packet as received
         self.received_ns = received_ns  #: on this host's clock
-        self.overtaken = False  #: whether a result of a later frame of the same camera arrived before it
+        self.overtaken = False  #: whether a result for a later frame of the same camera arrived earlier
         self._offset_ns = offset_ns
         self._history = history
         self._clock = clock
@@ -67,12 +67,12 @@ class Result:
 
     @property
     def captured_ns(self) -> int:
-        """When the frame was captured."""
+        """Time at which the frame was captured."""
         return self.header.captured_ns
 
     @property
     def made_ns(self) -> int:
-        """When the processor finished it."""
+        """Time at which the processor finished the result."""
         return self.header.made_ns
 
     @property
@@ -87,16 +87,16 @@ class Result:
 
     @property
     def value(self) -> Any:
-        """The return value of ``process``, with dataclasses as dicts, tuples as lists, and read-only arrays.
+        """The value that ``process`` returned, with dataclasses as dicts, tuples as lists, and read-only arrays.
 
-        Raises :class:`DecodeError` if the payload is malformed, which only happens if another program sent it.
+        Raises :class:`DecodeError` if the payload is malformed, which can only happen if another program sent it.
         """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
         return self._value
 
     def to(self, kind: type[T]) -> T:
-        """Return the value as a dataclass, ``msgspec.Struct`` or other type, or raise :class:`DecodeError`."""
+        """Convert the value to a dataclass, ``msgspec.Struct`` or other type; raise :class:`DecodeError` on failure."""
         try:
             return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
         except (msgspec.ValidationError, TypeError) as error:
@@ -117,20 +117,20 @@ def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (signature of msg
 
 
 class ResultMailbox:
-    """Keeps the newest result of each processor for one consumer; skips results that are too old when taken."""
+    """Keeps the newest result of each processor for one consumer, and skips those that are too old when taken."""
 
     def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
-        """Create an empty mailbox. When results are taken, those older than ``max_age_s`` [s] are skipped."""
+        """Create an empty mailbox. Results older than ``max_age_s`` [s] are skipped when results are taken."""
         self.notifier = notifier or Notifier()
-        self.expired = 0  #: number of results that were too old when their turn came
+        self.expired = 0  #: number of results that were too old when they would have been taken
         self.closed = False
         self._max_age_s = max_age_s
         self._mailboxes: dict[str, Mailbox[Result]] = {}
 
     def put(self, result: Result) -> None:
-        """Add a result. Call only on the receiving thread. Results that arrive after newer ones are ignored."""
+        """Add a result. Must be called on the receiving thread. Results that arrive after newer ones are ignored."""
         if result.overtaken:
-            return  # it is counted by its channel
+            return  # its channel counts it
         mailbox = self._mailboxes.get(result.processor)
         if mailbox is None:
             mailbox = Mailbox(1, self.notifier)
@@ -142,7 +142,7 @@ class ResultMailbox:
         mailbox.put(result)
 
     def take(self) -> Result | None:
-        """Remove and return the oldest waiting result (one per processor); None if there is none. Does not wait."""
+        """Remove and return the oldest waiting result (one per processor); None if there is none. Never waits."""
         while waiting := [mailbox for mailbox in self._mailboxes.values() if mailbox.waiting]:
             result = min(waiting, key=_captured_ns).take()
             if result is None or not is_old(result, self._max_age_s):
@@ -151,7 +151,7 @@ class ResultMailbox:
         return None
 
     def wait(self, timeout_s: float) -> Result | None:
-        """Wait for a result and take it; return None after ``timeout_s`` or once closed."""
+        """Wait for a result and take it; return None after ``timeout_s`` or once the mailbox is closed."""
         deadline = time.monotonic() + timeout_s
         while self.notifier.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
             result = None if self.closed else self.take()
@@ -160,18 +160,18 @@ class ResultMailbox:
         return None
 
     def close(self) -> None:
-        """Wake all waiting threads; later waits return at once."""
+        """Wake all waiting threads and make later waits return immediately."""
         self.closed = True
         self.notifier.notify()
 
     @property
     def waiting(self) -> bool:
-        """Whether there is a result, even one that is too old."""
+        """Whether a result is waiting, even if it is too old."""
         return any(mailbox.waiting for mailbox in self._mailboxes.values())
 
     @property
     def pushed_out(self) -> int:
-        """Results replaced by newer ones."""
+        """Number of results replaced by newer ones."""
         return self.dropped - self.expired
 
     @property
@@ -181,22 +181,22 @@ class ResultMailbox:
 
 
 def is_old(result: Result, max_age_s: float | None) -> bool:
-    """Return whether a result is now older than ``max_age_s``; always False if that is None."""
+    """Return whether a result is older than ``max_age_s`` now; always False if ``max_age_s`` is None."""
     return max_age_s is not None and result.age_s > max_age_s
 
 
 class ResultListener(Listener[Result]):
-    """A listener that skips results too old when their turn comes, counting them in ``expired``."""
+    """A listener that skips results that are too old when delivered, and counts them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
-        """Start calling the function; arguments as for :class:`Listener`, and ``max_age_s`` [s], None for no limit."""
-        self.expired = 0  #: results that were too old when their turn came
+        """Start calling the function; ``max_age_s`` [s], None: no limit; other arguments as for :class:`Listener`."""
+        self.expired = 0  #: number of results too old when they would have been delivered
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
 
     @property
     def dropped(self) -> int:
-        """Results that were replaced by newer ones or too old."""
+        """Number of results that were replaced by newer ones or were too old."""
         return super().dropped + self.expired
 
     def _call(self, sample: Result) -> None:
@@ -207,20 +207,20 @@ class ResultListener(Listener[Result]):
 
 
 class ResultChannel(Channel[Result]):
-    """Results of one processor, except those for frames older than a previous result's frame."""
+    """Results of one processor, without those for frames older than the frame of an earlier result."""
 
     def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
         self.name = results(processor)  #: name of the topic
         super().__init__(lambda on: connection.subscribe(self.name, on))
         self.newest: Result | None = None
-        self.notifier = scheduler.notifier()  #: notified with each result
+        self.notifier = scheduler.notifier()  #: notified of each result
         self.counter = ChannelCounter()
         self._overtaken = 0
         self._numbers: dict[int, int] = {}  # number of the last result from each worker
         self._captured: dict[str, int] = {}  # capture time of the newest frame of each camera
 
     def restart(self) -> None:
-        """Forget the numbers of workers and frames, because a newly connected proxy starts new series."""
+        """Forget the numbers of workers and frames, because a newly connected proxy starts new ones."""
         self._numbers.clear()
         self._captured.clear()
 
@@ -229,7 +229,7 @@ class ResultChannel(Channel[Result]):
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:
-        """Publish a result unless a newer one was published; return False if it already arrived on the other topic."""
+        """Publish a result unless a newer one was; return False if it has already arrived on the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -263,9 +263,9 @@ class ResultChannels:
         self._sent: Counter[str] = Counter()
 
     def channel(self, processor: str) -> ResultChannel:
-        """Return the channel of a processor's results, even if no such processor runs.
+        """Return the channel of a processor's results, even if no such processor is running.
 
-        Raises :class:`UsageError` for an invalid name, and :class:`ClosedError` if the drone was closed.
+        Raises :class:`UsageError` if the name is invalid, and :class:`ClosedError` if the drone was closed.
         """
         self._connection.check_open()
         return self._made(checked_name(processor))
@@ -283,7 +283,7 @@ class ResultChannels:
         return list(self._channels.values())
 
     def next_number(self, processor: str) -> int:
-        """Return the number of this application's next result, for one worker of a processor at a time."""
+        """Return the number of this application's next result. Each processor may have only one worker at a time."""
         self._sent[processor] += 1
         return self._sent[processor]
 
@@ -305,7 +305,7 @@ class ResultChannels:
             self.everything.publish(result)
 
     def _make_room(self) -> None:
-        """Forget channels without consumers, oldest first, if there are too many: programs may use invented names."""
+        """If there are too many channels, forget those without consumers, oldest first: programs may invent names."""
         with self._lock:
             unused = [name for name, one in self._channels.items() if not one.subscribed]
             surplus = len(self._channels) + 1 - MAX_CHANNELS
@@ -319,7 +319,7 @@ def _captured_ns(mailbox: Mailbox[Result]) -> int:
 
 
 def silence(processor: str, timeout_s: float, expired: int) -> str:
-    """Return the error message for missing results, including the number of results that were too old."""
+    """Return the error message for missing results, including how many results were too old."""
     if expired:
         return f"no sufficiently new result of {processor} arrived within {timeout_s:g} s; {expired} were too old"
     return (

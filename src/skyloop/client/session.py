@@ -1,4 +1,4 @@
-"""One session with a proxy, from the first packet to the last: callbacks of the transport, and requests."""
+"""Run one session with a proxy from the first packet to the last: transport callbacks and requests."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
 RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
 
-#: A callback that is called once, with the answer to a request or with the error.
+#: A callback that is called once, with either the answer to a request or an error.
 Done = Callable[[AnyReply | LinkError], None]
 
 
@@ -48,7 +48,7 @@ class _Pending:
 
 
 class Requests:
-    """The unanswered requests of one connection. Requests are idempotent and are repeated until answered."""
+    """Unanswered requests of one connection. Requests are idempotent and are repeated until answered."""
 
     def __init__(self, send: Callable[[bytes], bool]) -> None:
         self._send = send
@@ -60,8 +60,8 @@ class Requests:
     def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int, *, again_s: float = RETRY_S) -> None:
         """Send a request, and repeat it after ``again_s`` and then every 0.3 s until it is answered.
 
-        ``done`` is called once: on the receiving thread, on the thread that calls :meth:`tick` or :meth:`fail` or, if
-        the connection has already failed, on this one. After ``timeout_s`` it gets a :class:`NoAnswerError`.
+        ``done`` is called once: on the receiving thread, on the thread that calls :meth:`tick` or :meth:`fail`, or on
+        the calling thread if the connection has already failed. After ``timeout_s``, it gets a :class:`NoAnswerError`.
         """
         with self._lock:
             failed = self._failed
@@ -74,7 +74,7 @@ class Requests:
         if failed is not None:
             done(failed)
         else:
-            self._send(packet)  # if it can't be handed over now, tick() sends it again
+            self._send(packet)  # if the transport can't take it now, tick() sends it again
 
     def answered(self, reply: Reply) -> bool:
         """Handle an answer; return False if the request is unknown or has timed out."""
@@ -110,67 +110,67 @@ class Requests:
 
 
 PING_S: Final = 1.0  #: time limit for a ping
-FEEDBACK_STALL_S: Final = 1.0  #: time without feedback, although the proxy responds, after which to resubscribe
+FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responding proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
-_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock if it differs from ours
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval while there have been only a few round trips
+_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock that differs from ours
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval after only a few round trips
 _FIRST: Final = 5
 
 
 class ConnectionHandler(Protocol):
-    """Receives samples on the receiving thread and changes of the connection on the supervisor's thread."""
+    """Receives samples on the receiving thread, and connection changes on the supervisor's thread."""
 
-    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, but sent nothing else yet
+    def connected(self, welcome: Welcome) -> None: ...  #: a proxy has answered Hello, and has sent nothing else yet
     def disconnected(self) -> None: ...
     def link_changed(self, state: LinkState, reason: str) -> None: ...
-    def tick(self, now_ns: int) -> int: ...  #: does everything due; returns the latest time to call it again [ns]
+    def tick(self, now_ns: int) -> int: ...  #: does all due work; returns the latest time of the next call [ns]
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     @property
-    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: handlers for all other kinds of samples
+    def samples(self) -> Mapping[type, Callable[[Any, int], None]]: ...  #: returns the handlers of all other samples
 
 
 class ProxySession:
-    """Decodes and counts packets on the transport's receiving thread, and passes them to the handler.
+    """Decodes and counts packets on the transport's receiving thread, and passes the samples to the handler.
 
-    It is the :class:`skyloop.transport.base.ClientHandler` of one connection.
+    Implements :class:`skyloop.transport.base.ClientHandler` for one connection.
     """
 
     def __init__(
         self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock, dial: Dialer
     ) -> None:
-        """Connect; ``poke`` wakes the supervisor. Raises the dialer's errors."""
+        """Connect to the proxy; ``poke`` wakes the supervisor. Raises the dialer's errors."""
         self._handler = handler
         self._poke = poke
         self._clock = clock
-        self.open = True  #: whether neither end has closed the session
-        self._quiet = False  # this end has closed the session, so later arrivals are ignored
+        self.open = True  #: False once either end has closed the session
+        self._quiet = False  # whether this end has closed the session; later arrivals are ignored
         self._up = False
         self._pinged_ns = 0
-        self._pinged = False  # a ping is unanswered
+        self._pinged = False  # whether a ping is unanswered
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # the requested topics that each of the transport's topics serves
+        self._video_users: dict[str, set[str]] = {}  # by topic of the transport: the requested topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # the variant of feedback that arrives in this session
+        self._feedback = PLAIN  # the variant of feedback received in this session
         self._only_plain = False  # whether the proxy offers no other variant
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock minus ours
-        self.closed_reason: str | None = None  #: why the session ended; None while it has not
+        self.closed_reason: str | None = None  #: why the session ended; None while it is open
         self.receiver = 0  #: identity of the receiving thread
-        self.look_ns = 0  #: when the supervisor next evaluates its state
-        self._end = dial(self)  # must be last, because packets may arrive at once
+        self.look_ns = 0  #: time at which the supervisor next evaluates the session's state
+        self._end = dial(self)  # must be last, because packets may arrive immediately
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
 
     # Set-up and end --------------------------------------------------------------------------------------------
 
     def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
-        """Use the answer to Hello, sent at ``sent_ns``, as the first measurement of the clock offset.
+        """Use the answer to a Hello sent at ``sent_ns`` as the first measurement of the clock offset.
 
-        On one host, both ends read the same clock unless they are in different time namespaces.
+        On one host, both processes read the same clock unless they are in different time namespaces.
         """
         if welcome.clock and welcome.clock != clock_identity():
             self._same_clock = False
@@ -197,7 +197,7 @@ class ProxySession:
 
     @property
     def transmit(self) -> Callable[[bytes], bool]:
-        """The send function of the transport itself, without another layer, for frequent packets."""
+        """The transport's own send function, without another layer, for frequent packets."""
         return self._end.send
 
     def send(self, packet: bytes) -> bool:
@@ -210,11 +210,11 @@ class ProxySession:
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is currently the one that receives."""
+        """Whether the calling thread is the thread that currently receives."""
         return self.receiver == threading.get_ident() or self._end.receiving
 
     def subscribe(self, topic: str, on: bool) -> None:
-        """Subscribe to or unsubscribe from a topic. Video shared by several requests is subscribed to once."""
+        """Subscribe to or unsubscribe from a topic. Video that several requests share is subscribed to only once."""
         if topic.startswith(_VIDEOS):
             carrier = _carrier(topic, variants=self.variants)
             users = self._video_users.setdefault(carrier, set())
@@ -231,23 +231,23 @@ class ProxySession:
         self._end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
-        """Repeat due requests, and ping the proxy if nothing arrives from it or its clock needs measuring."""
+        """Repeat due requests; ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
-        late_ns = self.monitor.late_ns  # time without data after which the proxy is pinged
+        late_ns = self.monitor.late_ns  # time without data before the proxy is pinged
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
         if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
-            # Send one ping at a time, and only once: on a stalled path, queued pings and answers delay everything else.
+            # Only one ping may be outstanding: on a stalled path, queued pings and answers delay everything else.
             self._pinged = True
             self.requests.ask(Ping(now_ns), self._ponged, PING_S, now_ns, again_s=PING_S)
 
     def renew_feedback(self, now_ns: int) -> None:
-        """Subscribe to feedback again if none is arriving although the proxy answers.
+        """Resubscribe to feedback if none arrives although the proxy answers.
 
-        If only part of the feedback was requested, plain feedback replaces it for the rest of this session, because the
-        proxy may be older or have no room for more variants. Consumers filter their samples anyway.
+        If only a reduced rate was requested, plain feedback replaces it for the rest of this session, because the proxy
+        may be too old or have no room for more variants. Consumers filter their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
         answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns
@@ -259,7 +259,7 @@ class ProxySession:
         self._end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
-        """From now on, evaluate the link by the new feedback rate."""
+        """Evaluate the link by the new feedback rate from now on."""
         if request == self._feedback:
             return
         now_ns, self._feedback = self._clock(), request
@@ -282,7 +282,7 @@ class ProxySession:
     # Callbacks of the transport ------------------------------------------------------------------------------------
 
     def packet(self, packet: bytes) -> None:
-        """Decode a packet and pass it on; on the receiving thread."""
+        """Decode a packet and pass it to its handler; called on the receiving thread."""
         now_ns = self._clock()
         try:
             sample: Sample = decode(packet)
@@ -294,21 +294,21 @@ class ProxySession:
         if type(sample) is Feedback:
             if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
-                if not self._up:  # on the first sample, wake the supervisor, which reports that the link is up
+                if not self._up:  # on the first sample, wake the supervisor to report that the link is up
                     self._up = True
                     self._poke()
             return
         handler = self._handlers.get(type(sample))
-        if handler is None:  # proxies do not send this kind of sample
+        if handler is None:  # proxies don't send this kind of sample
             self._malformed()
             return
         self.monitor.received_ns = now_ns
         handler(sample, now_ns)
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
-        """Check a frame's size and pass it on; on the receiving thread.
+        """Check a frame's size and pass the frame to its handler; called on the receiving thread.
 
-        ``topic`` is the request that the frame answers; empty for a plain frame of the camera.
+        ``topic`` names the request that the frame answers; it is empty for a plain frame of the camera.
         """
         now_ns = self._clock()
         if self._quiet:
@@ -320,7 +320,7 @@ class ProxySession:
         self._handler.frame(header, pixels, now_ns, topic)
 
     def closed(self, reason: str) -> None:
-        """Handle a connection closed by the transport; the supervisor reconnects."""
+        """Handle a connection that the transport has closed; the supervisor reconnects."""
         self.closed_reason, self.open = reason, False
         self._poke()
 
@@ -341,10 +341,10 @@ def frame_size(header: FrameHeader) -> int:
 
 
 def _carrier(topic: str, *, variants: bool) -> str:
-    """Return the transport's topic that carries this video.
+    """Return the transport topic that carries the video of ``topic``.
 
-    ``variants``: whether the transport carries frames in the format requested. If not, all frames arrive unchanged, and
-    each channel filters and scales them itself.
+    ``variants``: whether the transport delivers frames in the requested form. If not, all frames arrive unchanged, and
+    each channel filters and scales them.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):

@@ -1,4 +1,4 @@
-"""Swarms: several drones connected, commanded and awaited together, with a policy for failures."""
+"""Connect, command and await several drones together, with a policy for failures."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ OnError = Literal["continue", "raise", "stop", "land"]
 Target = str | Mapping[str, str]
 Missing = Literal["raise", "skip"]
 
-_WILD: Final = frozenset("*?[")  #: characters that make a name a pattern
+_WILD: Final = frozenset("*?[")  #: characters that turn a name into a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _ROUNDING_S: Final = 1e-6
 _log = logging.getLogger("skyloop")
@@ -62,22 +62,22 @@ _log = logging.getLogger("skyloop")
 class Tick:
     """One iteration of :meth:`Swarm.ticks`."""
 
-    number: int  #: counted from 0
+    number: int  #: number of the tick, counted from 0
     elapsed_s: float  #: time since the first tick [s]
-    late_s: float  #: delay after its due time [s]
+    late_s: float  #: delay after the tick was due [s]
 
 
 @explains_moved_options
 def swarm(
     *targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Unpack[ConnectOptions]
 ) -> Swarm:
-    """Connect to several drones at the same time; returns when all are connected.
+    """Connect to several drones at the same time, and return once all of them are connected.
 
     Args:
         *targets: Names of running proxies, patterns such as ``"drone*"`` for running proxies, addresses of vehicles
-            such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
-            either, ``{"left": "sim://?seed=1"}``.
-        on_error: What the others do when a drone fails; see :class:`Swarm`.
+            such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to either,
+            ``{"left": "sim://?seed=1"}``.
+        on_error: What the other drones do when one fails; see :class:`Swarm`.
         missing: How to handle drones that can't be connected: ``"raise"`` fails the call, ``"skip"`` leaves them out
             as long as at least one drone connects.
         **options: As for :func:`skyloop.connect`, for each drone.
@@ -88,7 +88,7 @@ def swarm(
     Raises:
         SwarmError: If drones can't be connected, with the reason for each; the others are closed.
         UnknownNameError: If a pattern matches no running proxy.
-        UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
+        UsageError: If a drone is named twice, no drone is named, or ``on_error`` or ``missing`` is unknown.
     """
     if missing not in ("raise", "skip"):
         raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
@@ -106,9 +106,9 @@ def swarm(
 
 
 def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
-    """Return the targets by name, in the order given. Pure. See :func:`swarm` for targets and errors.
+    """Return the targets by name, in the given order. Pure. See :func:`swarm` for the targets and the errors.
 
-    ``running`` returns the names of the running proxies; it is only called if a target is a pattern.
+    ``running`` returns the names of the running proxies; it is called only if a target is a pattern.
     """
     chosen: dict[str, str] = {}
     counts: dict[str, int] = {}
@@ -150,10 +150,10 @@ def check_policy(on_error: str) -> None:
 
 
 class Swarm:
-    """Drones by name, in a fixed order; returned by :func:`skyloop.swarm`. A context manager, for one thread at a time.
+    """Drones by name, in a fixed order; :func:`skyloop.swarm` returns it. A context manager for one thread at a time.
 
-    ``drones["alpha"]`` is one :class:`Drone`, and iterating yields all of them. A command goes to all *active* drones.
-    If it fails for some, the others still get it; ``on_error`` decides what happens next:
+    ``drones["alpha"]`` is one :class:`Drone`; iterating over the swarm yields all of them. A command goes to all
+    *active* drones. If it fails for some drones, the others still get it, and ``on_error`` decides what happens next:
 
     - ``"continue"``: failed drones hover and are set aside, the others continue. :attr:`errors` lists those set aside;
       a drone taken over by another application returns when its authority is given back, the others return with
@@ -162,13 +162,13 @@ class Swarm:
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.
     - ``"land"``: the others land, then :class:`SwarmError` is raised.
 
-    A drone whose link is lost receives no commands and rejoins when the link is restored; failing to send a command
-    counts as a failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same time
-    (or hover, with ``on_exit``), including those set aside, even if some of them fail.
+    A drone whose link is lost receives no commands until the link is restored. Failing to send a command counts as a
+    failure unless ``on_error`` is ``"continue"``. At the end of the block, all drones land at the same time (or hover,
+    depending on ``on_exit``), including drones that were set aside, even if some of them fail.
 
-    Commands return a dict with the result of the same command of :class:`Drone` for each name. Methods that command,
-    read or wait raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are not
-    finite, and :class:`ClosedError` once the swarm was closed.
+    Commands return a dict that maps each name to the result of the same command of :class:`Drone`. Methods that
+    command, read or wait raise :class:`SwarmError` depending on ``on_error``, :class:`UsageError` for numbers that are
+    not finite, and :class:`ClosedError` after the swarm was closed.
     """
 
     def __init__(
@@ -178,10 +178,10 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """Take over connected drones, by name, and close them at the end; see :func:`skyloop.swarm`.
+        """Take over connected drones, given by name, and close them at the end; see :func:`skyloop.swarm`.
 
-        ``missing`` are the requested drones that could not be connected, with the reasons. Raises :class:`UsageError`
-        if there is no drone, or ``on_error`` is unknown.
+        ``missing`` contains the drones that could not be connected, with the reasons. Raises :class:`UsageError` if
+        there are no drones or ``on_error`` is unknown.
         """
         check_policy(on_error)
         if not drones:
@@ -197,15 +197,12 @@ class Swarm:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all drones, including those set aside."""
+        """Names of all drones, including drones that were set aside."""
         return tuple(self._drones)
 
     @property
     def active(self) -> dict[str, Drone]:
-        """The drones that receive commands, by name.
-
-        Reading it readmits drones that have regained the authority.
-        """
+        """The drones that receive commands, by name. Reading this readmits drones that have regained the authority."""
         for name, error in list(self._aside.items()):
             if isinstance(error, AuthorityError) and self._drones[name].authority.state == "held":
                 del self._aside[name]
@@ -214,14 +211,14 @@ class Swarm:
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """The reasons why drones do not take part, by name: drones that were set aside or never connected."""
+        """Reasons, by name, why drones do not take part: they were set aside, or were never connected."""
         return {**self.missing, **self._aside}
 
     def readmit(self, *names: str) -> None:
         """Reactivate drones that were set aside.
 
         Args:
-            *names: Names of the drones; all of them if none is given.
+            *names: Names of the drones; if none are given, all drones.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names.
@@ -231,7 +228,7 @@ class Swarm:
             self._aside.pop(name, None)
 
     def items(self) -> list[tuple[str, Drone]]:
-        """Return (name, drone) of all drones, including those set aside."""
+        """Return the (name, drone) pairs of all drones, including drones that were set aside."""
         return list(self._drones.items())
 
     def __getitem__(self, name: str) -> Drone:
@@ -256,45 +253,45 @@ class Swarm:
     # Commands --------------------------------------------------------------------------------------------------
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
-        """Take off with all active drones at the same time; see :meth:`Drone.takeoff`.
+        """Make all active drones take off at the same time; see :meth:`Drone.takeoff`.
 
         Args:
-            wait: Wait until every drone hovers.
-            timeout_s: How long to wait [s].
+            wait: Whether to wait until every drone hovers.
+            timeout_s: Maximum time to wait [s].
         """
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land all active drones at their current positions, at the same time; see :meth:`Drone.land`.
+        """Land all active drones at the same time, each at its current position; see :meth:`Drone.land`.
 
         Args:
-            wait: Wait until each has landed.
+            wait: Whether to wait until every drone has landed.
             timeout_s: How long to wait [s].
         """
         self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
 
     def hover(self) -> dict[str, bool]:
-        """Stop and hold the position, with all active drones.
+        """Make all active drones stop and hold position.
 
-        Drones flown by other applications are left alone; only a drone's own ``drones[name].hover()`` takes it back.
+        Drones flown by other applications are left alone; to take one of them back, call ``drones[name].hover()``.
         """
         return self.send(dict.fromkeys(self.active, Hover()))
 
     def idle(self) -> dict[str, bool]:
-        """Keep the authority and leave the vehicles as they are."""
+        """Keep the authority without changing what the vehicles do."""
         return self.command(Idle())
 
     @by_name
     def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """Fly all active drones at the same velocity, each in its own levelled body axes.
+        """Fly all active drones at the same velocity, given in each drone's own levelled body axes.
 
         Args:
-            forward: Along x, forward [m/s].
-            left: Along y, to the left [m/s].
-            up: Along z, up [m/s].
-            yaw_rate: Counter-clockwise seen from above [rad/s].
+            forward: Velocity along x, forward [m/s].
+            left: Velocity along y, to the left [m/s].
+            up: Velocity along z, up [m/s].
+            yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
         """
         return self.command(
             Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
@@ -304,12 +301,12 @@ class Swarm:
     def attitude(
         self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """Hold the same attitude with all active drones; see :meth:`Drone.attitude`.
+        """Make all active drones hold the same attitude; see :meth:`Drone.attitude`.
 
         Args:
-            roll: Right side down is positive [rad].
-            pitch: Nose down is positive [rad].
-            climb: Vertical velocity, up [m/s].
+            roll: Roll [rad]; right side down is positive.
+            pitch: Pitch [rad]; nose down is positive.
+            climb: Vertical velocity, up positive [m/s].
             yaw_rate: Counter-clockwise seen from above [rad/s].
         """
         return self.command(
@@ -325,20 +322,20 @@ class Swarm:
         timeout_s: float = 60.0,
         tolerance_m: float = 0.2,
     ) -> None:
-        """Fly each drone straight to its own position, all at the same time; see :meth:`Drone.go_to`.
+        """Fly each drone straight to its own position, all of them at the same time; see :meth:`Drone.go_to`.
 
-        Nothing keeps the drones apart on the way; use :class:`skyloop.control.formation_flight.Formation` to plan safe
-        paths. Drones that are set aside are skipped.
+        Nothing keeps the drones apart during the flight; use :class:`skyloop.control.formation_flight.Formation` to
+        plan safe paths. Drones that were set aside are skipped.
 
         Args:
-            places: Position of each drone, by name: x, y, z in its world axes [m], and optionally the yaw [rad].
-            speed: Maximum speed on the way [m/s]; None: as fast as the limits allow.
-            wait: Wait until each drone has arrived; otherwise only send the commands.
+            places: Positions by name: x, y, z in the drone's world axes [m], optionally followed by the yaw [rad].
+            speed: Maximum speed [m/s]; None: as fast as the limits allow.
+            wait: Whether to wait until every drone has arrived, rather than only send the commands.
             timeout_s: How long to wait [s].
-            tolerance_m: Maximum distance from the position at arrival [m].
+            tolerance_m: Maximum distance from the position on arrival [m].
 
         Raises:
-            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
+            UnknownNameError: If a name is not that of a drone of the swarm; nothing is sent in that case.
             UsageError: If a position is invalid; nothing is sent in that case.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
@@ -361,18 +358,18 @@ class Swarm:
     def return_to_start(
         self, height_m: float | None = None, *, land: bool | None = None, wait: bool = True, timeout_s: float = 180.0
     ) -> None:
-        """Fly all active drones back to where each took off, all at the same time; see :meth:`Drone.return_to_start`.
+        """Fly all active drones back to where they took off, at the same time; see :meth:`Drone.return_to_start`.
 
-        Nothing keeps the drones apart on the way.
+        Nothing keeps the drones apart during the flight.
 
         Args:
-            height_m: Minimum height above the start on the way [m]; None: each drone's ``return.height``.
-            land: Whether to land there instead of hovering above it; None: each drone's ``return.land``.
-            wait: Wait until each has landed, or hovers above its start; otherwise only send the commands.
+            height_m: Minimum height above the start during the flight [m]; None: each drone's ``return.height``.
+            land: Whether to land at the start instead of hovering above it; None: each drone's ``return.land``.
+            wait: Whether to wait until every drone has landed or hovers above its start.
             timeout_s: How long to wait [s].
 
         Raises:
-            UsageError: If an argument makes no sense; nothing is sent in that case.
+            UsageError: If an argument is invalid; nothing is sent in that case.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -382,14 +379,14 @@ class Swarm:
         )
 
     def reset_emergency(self) -> dict[str, bool]:
-        """Leave the emergency state while on the ground, with all active drones."""
+        """Make all active drones leave the emergency state while on the ground."""
         return self.command(ResetEmergency())
 
     def emergency_stop(self) -> dict[str, bool]:
-        """Cut the motors of all drones at once, including those set aside: they fall.
+        """Cut the motors of all drones immediately, including drones that were set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some drones, whatever the value of ``on_error``.
+            SwarmError: If the command could not be sent to some drones, regardless of ``on_error``.
         """
         sent, errors = _try_all(self._drones, lambda drone: drone.emergency_stop())
         errors |= {name: _not_sent(self._drones[name]) for name, handed in sent.items() if not handed}
@@ -402,20 +399,20 @@ class Swarm:
         return self.send(dict.fromkeys(self.active, action))
 
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone it is for, sending them all at once.
+        """Make each action the newest set-point of its drone, and send all of them at the same time.
 
-        Drones that are set aside are skipped. A hover doesn't take a drone from others (see :meth:`hover`).
-        :attr:`spread` is the time between the first and the last command.
+        Drones that are set aside are skipped. A hover doesn't take a drone from another application (see
+        :meth:`hover`). :attr:`spread` is the time between the first and the last command.
 
         Args:
-            actions: Actions by name of the drone.
+            actions: Actions by drone name.
 
         Returns:
-            By name, True if the command was handed to the transport.
+            For each name, True if the command was handed to the transport.
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
-            UsageError: If an action can't be commanded or has non-finite numbers; nothing is sent in that case.
+            UsageError: If an action can't be commanded or contains numbers that are not finite; nothing is sent then.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -425,14 +422,14 @@ class Swarm:
             checked(action)
         active = self.active
         ready = {name: active[name] for name in actions if name in active}
-        # Wait at most a few milliseconds until every drone can send a set-point at once, so that all are sent together.
+        # Wait at most a few milliseconds until every drone can send a set-point, and then send them all together.
         open_ns = max((drone._commands.schedule.open_ns for drone in ready.values()), default=0)
         time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
         stamps: list[int] = []
 
         def hand_over(name: str) -> bool:
             action, commands = actions[name], ready[name]._commands
-            if type(action) is Hover:  # a hover of the whole swarm must not take a drone from its safety pilot
+            if type(action) is Hover:  # a hover of the swarm must not take a drone from its safety pilot
                 handed = commands.command(action, automatic=type(commands.newest) is not Land)
             else:
                 handed = ready[name].command(action)
@@ -450,14 +447,14 @@ class Swarm:
         return sent
 
     def each(self, function: Callable[[Drone], T], what: str = "") -> dict[str, T]:
-        """Call ``function`` with each active drone in a separate thread, and wait for all.
+        """Call ``function`` with each active drone in a separate thread, and wait for all calls.
 
         Args:
-            function: A drone for which it raises :class:`SkyloopError` fails; other exceptions are re-raised.
-            what: Name of the action in error messages; empty: the function's name.
+            function: If it raises :class:`SkyloopError`, its drone fails; other exceptions are re-raised.
+            what: Name of the action for error messages; if empty, the function's name is used.
 
         Returns:
-            The results of the calls, by name of the drone.
+            The results of the calls, by drone name.
         """
         self._check_open()
 
@@ -496,7 +493,7 @@ class Swarm:
         """Return the newest feedback of each active drone, by name.
 
         Args:
-            max_age_s: Maximum age since capture [s]; a drone with older feedback has failed.
+            max_age_s: Maximum age since capture [s]; a drone whose feedback is older has failed.
         """
         self._check_open()
         found, errors = _try_all(self.active, lambda drone: drone.feedback(max_age_s=max_age_s))
@@ -506,17 +503,17 @@ class Swarm:
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
         """Wait until all active drones meet a condition *at the same time*.
 
-        A drone with a lost link does not meet it, whatever its last feedback. Drones that don't meet it have failed.
+        A drone whose link is lost does not meet the condition. Drones that don't meet it in time have failed.
 
         Args:
-            wanted: A flight state or its name, several of these, or a predicate on feedback.
+            wanted: A flight state or its name, several of them, or a function that tests feedback.
             timeout_s: How long to wait [s].
 
         Returns:
-            The feedback of the drones that meet it, by name.
+            The feedback of the drones that meet the condition, by name.
 
         Raises:
-            UnknownNameError: If there is no flight state of this name.
+            UnknownNameError: If no flight state has this name.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -540,16 +537,16 @@ class Swarm:
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
         """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
 
-        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts from its end.
-        When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, drones still flying velocities or
-        attitudes that it sent hover at once, because no newer ones would follow.
+        Ends when the swarm is closed. If an iteration takes longer than a period, the schedule restarts at the end of
+        that iteration. When the loop ends, whether by time, a ``break``, an exception or Ctrl-C, any drone that still
+        flies a velocity or attitude sent by the loop hovers immediately, because no newer command would follow.
 
         Args:
             rate_hz: Ticks per second, 0.1 to 200.
-            seconds: Duration [s]; None: until the loop ends.
+            seconds: Duration [s]; None: until the loop is left.
 
         Raises:
-            UsageError: If ``rate_hz`` is out of range; raised by the first iteration.
+            UsageError: If ``rate_hz`` is out of range; the first iteration raises it.
         """
         if not 0.1 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 0.1 to 200 ticks a second")
@@ -563,26 +560,26 @@ class Swarm:
                 yield Tick(count, due_s - begun_s, late_s)
                 count += 1
                 due_s = max(due_s + period_s, time.monotonic())
-        finally:  # if the loop ends by a break or an exception, this generator is dropped, and this runs at once
+        finally:  # after a break or an exception in the loop, Python closes this generator and runs this immediately
             for drone in self:
                 if isinstance(drone._commands.newest, Velocity | Attitude):
                     drone._piloting.let_go("the loop that flew it has ended")
 
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of each :meth:`send` [s]; None before the first call."""
+        """Time between the first and the last command of the last :meth:`send` [s]; None before the first call."""
         return distribution(np.frombuffer(bytes(self._spreads_ns), np.int64))
 
     # Failures ------------------------------------------------------------------------------------------------------
 
     def fail(self, what: str, errors: Mapping[str, Exception]) -> None:
-        """Apply ``on_error`` after some drones have failed. Does nothing if ``errors`` is empty.
+        """Apply ``on_error`` after a failure of some drones. Does nothing if ``errors`` is empty.
 
         The swarm's own commands call this method; programs that build on a swarm may call it, too.
 
         Args:
-            what: Name of the failed action, for the error.
-            errors: The exceptions, by name of the drone.
+            what: Name of the failed action, for the error message.
+            errors: The exceptions, by drone name.
 
         Raises:
             SwarmError: Depending on ``on_error``.
@@ -610,17 +607,17 @@ class Swarm:
     # The end ---------------------------------------------------------------------------------------------------
 
     def _leave(self) -> dict[str, Exception]:
-        """End the block: land all flying drones at the same time, and close. Return the errors by name. Idempotent."""
+        """End the block: land all flying drones at the same time, then close. Return the errors by name. Idempotent."""
         if self._closed:
             return {}
         self._closed = True
         for drone in self._drones.values():
             if not drone.closed:
-                drone._commands.bar()  # on all drones before the first one lands
+                drone._commands.bar()  # bar all drones before the first of them lands
         return end_flights(self._drones)
 
     def close(self) -> None:
-        """End all connections. Does not land. Idempotent."""
+        """End all connections. Does not land the drones. Idempotent."""
         self._closed = True
         with interrupt_deferred():
             in_parallel({name: drone.close for name, drone in self._drones.items()})
@@ -651,7 +648,7 @@ class Swarm:
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
     """Call ``function`` for each item in turn; return its results and its :class:`SkyloopError`, by name.
 
-    Any other exception is raised only after the function has been called for every item.
+    Any other exception is raised only after the function was called for every item.
     """
     results: dict[str, R] = {}
     raised: dict[str, Exception] = {}
@@ -664,7 +661,7 @@ def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[s
 
 
 def _expected(raised: Mapping[str, BaseException]) -> dict[str, Exception]:
-    """Return the exceptions if all of them are Skyloop's own; otherwise raise the first that is not."""
+    """Return the exceptions if all of them are Skyloop's own; otherwise raise the first other exception."""
     errors: dict[str, Exception] = {}
     for name, error in raised.items():
         if not isinstance(error, SkyloopError):
@@ -702,21 +699,21 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 
 
 def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
-    """End all drones' flights at the same time and close them; return the errors by name.
+    """End the flights of all drones at the same time and close the drones; return the errors by name.
 
-    Ctrl-C ends the wait for the landings, but each drone is still told to land, and lands without this program.
+    Ctrl-C stops waiting for the landings, but each drone is still told to land, and lands without this program.
     """
     return _problems(drones, lambda drone: drone._piloting.end_flight())
 
 
 def _problems(drones: Mapping[str, Drone], end: Callable[[Drone], SkyloopError | None]) -> dict[str, Exception]:
-    """Land all drones, or end all flights, at the same time; return the errors by name."""
+    """Land all drones, or end all flights, at the same time; return the errors by drone name."""
 
     def job(drone: Drone) -> Callable[[], SkyloopError | None]:
         def ended() -> SkyloopError | None:
             try:
                 return end(drone)
-            except GivenUpError:  # no caller is waiting for the result any more
+            except GivenUpError:  # no caller waits for the result any longer
                 return None
 
         return ended
@@ -734,15 +731,15 @@ def _not_sent(drone: Drone) -> LinkError:
 def in_parallel(
     jobs: Mapping[str, Callable[[], T]], interrupted: threading.Event | None = None
 ) -> tuple[dict[str, T], dict[str, Exception]]:
-    """Run all jobs, by name, at the same time, each in its own thread, and wait until all have ended.
+    """Run all jobs at the same time, each in its own thread, and wait until all of them have ended.
 
-    The threads are daemons; a job for which none can be started runs on the calling thread. An interrupt, or setting
-    ``interrupted``, ends the jobs' waits for commands (see :data:`skyloop.client.commands.cancelled`); their other work
-    ends normally.
+    The threads are daemons. If no thread can be started for a job, the job runs on the calling thread. An interrupt, or
+    setting ``interrupted``, stops the jobs from waiting for commands (see :data:`skyloop.client.commands.cancelled`).
+    Their other work ends normally.
 
     Returns:
-        The result of each job, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
-        re-raised here after all jobs have ended.
+        The result of each job, and the :class:`SkyloopError` that each job raised, both by name. Any other exception is
+        re-raised on the calling thread after all jobs have ended.
     """
     results: dict[str, T] = {}
     raised: dict[str, BaseException] = {}
@@ -761,7 +758,7 @@ def in_parallel(
         thread = threading.Thread(target=work, args=(name, job), name=f"skyloop-swarm-{name}", daemon=True)
         try:
             thread.start()
-        except RuntimeError:  # no thread is available: the drone must still land
+        except RuntimeError:  # no thread is available, but the drone must still land
             left.append(name)
         else:
             threads.append(thread)
@@ -772,7 +769,7 @@ def in_parallel(
                 raise raised[name]  # Ctrl-C on this thread: don't start any more jobs
         for thread in threads:
             thread.join()
-    except BaseException:  # Ctrl-C: a take-off must not be executed later
+    except BaseException:  # after Ctrl-C, a take-off must not be executed later
         interrupted.set()
         raise
     errors = _expected({name: raised[name] for name in jobs if name in raised})

@@ -1,4 +1,4 @@
-"""Handle the samples that arrive from a proxy: store the newest of each kind, count them, publish them."""
+"""Handle the samples that arrive from a proxy: store the newest of each kind, count it and publish it."""
 
 from __future__ import annotations
 
@@ -41,25 +41,25 @@ from skyloop.messages.subscription import PLAIN, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
 RECENT_EVENTS: Final = 256
-#: A condition to wait for: a flight state or its name, several (any of them will do), or a predicate on feedback.
+#: A condition to wait for: a flight state or its name, several of them (any one suffices), or a test of feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
 class LinkStatus:
-    """State of the two hops, with the reason for the last change."""
+    """State of the two links, with the reason for the last change."""
 
-    application: LinkState  #: hop from application to proxy
-    vehicle: LinkState  #: hop from proxy to vehicle, as last reported by the proxy
+    application: LinkState  #: link from the application to the proxy
+    vehicle: LinkState  #: link from the proxy to the vehicle, as last reported by the proxy
     reason: str = ""
-    remedy: str = ""  #: what the user can do about the vehicle's link while it is not up
+    remedy: str = ""  #: what the user can do to restore the vehicle's link while it is down
 
 
 class Mailboxes:
-    """Mailboxes for the newest feedback, frame and results, for one thread that waits for all of them.
+    """Mailboxes for the newest feedback, frame and results; one thread can wait for all of them.
 
-    It is a context manager; the mailboxes fill while it is open.
+    It is a context manager; the mailboxes receive samples while it is open.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class Mailboxes:
         processors: Iterable[str] | None = None,
         max_age_s: float | None = None,
     ) -> None:
-        """Create empty mailboxes as requested; see :class:`skyloop.extend.InboxOptions`.
+        """Create the requested mailboxes, empty; see :class:`skyloop.extend.InboxOptions`.
 
         Raises the same errors as :meth:`VideoChannels.channel` and :meth:`ResultChannels.channel`.
         """
         known = state.results
         named = [known.everything] if processors is None else [known.channel(one) for one in processors]
-        self.clock = state.scheduler.clock  #: the clock of a controller
+        self.clock = state.scheduler.clock  #: the clock that a controller uses
         self.notifier = state.sample_notifier()
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
         self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
@@ -104,11 +104,11 @@ class Mailboxes:
 
     @property
     def waiting(self) -> bool:
-        """Whether there is anything to take."""
+        """Whether any mailbox contains a sample."""
         return self.feedback.waiting or self.frames.waiting or self.results.waiting
 
     def frame(self) -> Frame | None:
-        """Return the newest frame and empty the mailbox; None if no new frame arrived or it can't be decoded."""
+        """Take and return the newest frame; None if no new frame has arrived or it can't be decoded."""
         arrival, video = self.frames.take(), self._video
         if arrival is None or video is None:
             return None
@@ -118,12 +118,13 @@ class Mailboxes:
 class FeedbackDemand:
     """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
-    A pilot gets every sample in full, because samples show its link, its authority and failsafes. So does an observer
-    until a consumer limits its request, or whenever a consumer needs them all. A connection uses one variant at a time.
+    A pilot always gets every sample in full, because samples report its link, its authority and failsafes. An observer
+    does too, until a consumer limits its request, or whenever a consumer needs every sample. Each connection uses one
+    variant.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription never changes after that."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes afterwards."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
@@ -133,7 +134,7 @@ class FeedbackDemand:
         connection.subscribe(PLAIN.topic)
 
     def want(self, request: FeedbackRequest, on: bool) -> None:
-        """Add a consumer of this request, or remove one."""
+        """Add or remove a consumer of this request."""
         with self._lock:
             count = self._wanted.get(request, 0) + (1 if on else -1)
             if count > 0:
@@ -159,18 +160,18 @@ class FeedbackDemand:
             self.want(request, False)
 
     def _update(self) -> None:
-        """Change the subscription if necessary. The lock is held."""
+        """Change the subscription if the requests need a different one. The caller must hold the lock."""
         asked = [*self._wanted, *self._kept]
         needed = PLAIN if self._whole or not asked else reduce(FeedbackRequest.union, asked)
         before = self.request
         if needed != before:
             self.request = needed
-            self._connection.subscribe(needed.topic, True)  # subscribe first, so that no sample is missed
+            self._connection.subscribe(needed.topic, True)  # subscribe before unsubscribing to miss no sample
             self._connection.subscribe(before.topic, False)
 
 
 class FeedbackChannel(Channel[Feedback]):
-    """Feedback for consumers that need fewer samples than the connection receives for others."""
+    """Feedback for consumers that need fewer samples than the connection receives."""
 
     def __init__(self, request: FeedbackRequest, demand: FeedbackDemand) -> None:
         super().__init__(lambda on: demand.want(request, on))
@@ -178,13 +179,13 @@ class FeedbackChannel(Channel[Feedback]):
         self._rate = RateLimiter(request.max_hz)
 
     def receive(self, sample: Feedback) -> None:
-        """Publish a sample if it is due; on the receiving thread."""
+        """Publish a sample if it is due; called on the receiving thread."""
         if self._consumers and self._rate.in_time(sample.published_ns):
             self.publish(sample)
 
 
 class ClientState:
-    """The newest state of a connected vehicle, and the channels that publish changes of it."""
+    """The newest state of a connected vehicle, and the channels that publish its changes."""
 
     def __init__(
         self, app: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
@@ -192,13 +193,13 @@ class ClientState:
         """Create the state of an unconnected drone; ``app`` is the application's name."""
         self.app = app
         self.scheduler = scheduler
-        self.listeners: list[Listener[Any]] = []  #: the application's active callbacks
+        self.listeners: list[Listener[Any]] = []  #: active callbacks of the application
         self.to_close: list[Callable[[], None]] = []  #: functions that release resources when the drone is closed
         self.welcome: Welcome | None = None
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback arrived, on this process's clock
         self.history = FeedbackHistory()
-        #: Notified on each feedback sample, and on every change that a thread may be waiting for.
+        #: Notified of each feedback sample, and of every other change for which a thread may be waiting.
         self.notifier = scheduler.notifier()
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
@@ -207,7 +208,7 @@ class ClientState:
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
         self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(PLAIN, on))
-        self.selected: tuple[FeedbackChannel, ...] = ()  #: for consumers with a limited request
+        self.selected: tuple[FeedbackChannel, ...] = ()  #: channels for consumers with a limited request
         self.on_event: Channel[Event] = Channel()
         self.on_link: Channel[LinkStatus] = Channel()
         self.on_command: Channel[Applied] = Channel(lambda on: connection.subscribe(COMMANDS, on))
@@ -220,7 +221,7 @@ class ClientState:
         self.results = ResultChannels(connection, scheduler, self.history)
         self._clock = scheduler.clock
         self._connection = connection
-        self._making = threading.RLock()  # so that two threads requesting the same channel get the same object
+        self._making = threading.RLock()  # ensures that two threads requesting the same channel get the same object
 
     @property
     def name(self) -> str:
@@ -232,12 +233,12 @@ class ClientState:
         return self.scheduler.sample_notifier(self._connection)
 
     def follow(self, find: Callable[[], C]) -> FollowingChannel[Any, C]:
-        """Return the channel that ``find`` returns, and follow it when the proxy restarts with other cameras."""
+        """Return the channel that ``find`` returns; it switches when the proxy restarts with different cameras."""
         return FollowingChannel(find, self.on_welcome)
 
     @contextmanager
     def closing(self, mailbox: Mailbox[Any] | ResultMailbox) -> Iterator[None]:
-        """Close ``mailbox``, which wakes its consumer, if the drone is closed during the block."""
+        """Close ``mailbox`` and thereby wake its consumer if the drone is closed during the block."""
         self.to_close.append(mailbox.close)
         try:
             yield
@@ -250,7 +251,7 @@ class ClientState:
             self.listeners.remove(listener)
 
     def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
-        """Return the error for a missing frame, with the reason if it is known."""
+        """Return the error for a missing frame, including the reason if it is known."""
         link = self.status
         words = [f"no frame of {camera} arrived within {timeout_s:g} s"]
         if link.vehicle is not LinkState.UP:
@@ -258,7 +259,7 @@ class ClientState:
         return NoAnswerError(": ".join(filter(None, words)))
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
-        """Return the channel that delivers feedback as requested, creating it on the first call."""
+        """Return the channel that delivers feedback as requested; create it on the first call."""
         if request.is_plain:
             return self.on_feedback
         with self._making:
@@ -277,7 +278,7 @@ class ClientState:
         self.notifier.notify()
 
     def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
-        """Return the statistics of every channel, by name; ``sends`` counts the commands that were sent."""
+        """Return the statistics of every channel, by name; ``sends`` counts the sent commands."""
         now_ns = self._clock()
         echoes = self.echoes.stats(now_ns)
         found = {
@@ -296,7 +297,7 @@ class ClientState:
         return found
 
     def wake_all(self) -> None:
-        """Wake every waiting thread, so that it checks its condition again."""
+        """Wake every waiting thread to make it check its condition again."""
         self.notifier.notify()
         for channel in tuple(self.video.variants.values()):
             channel.notifier.notify()
@@ -304,16 +305,16 @@ class ClientState:
             results.notifier.notify()
 
     def set_status(self, status: LinkStatus) -> None:
-        """Publish the changed state of the two hops."""
+        """Publish the changed state of the two links."""
         self.status = status
         self.on_link.publish(status)
         self.notifier.notify()
 
 
 class SessionSamples:
-    """Handles the samples and changes of the connection in every session.
+    """Handles the samples and the connection changes of every session.
 
-    ``feedback``, ``frame`` and the other samples arrive on the receiving thread, all else on the supervisor's.
+    ``feedback``, ``frame`` and the other samples arrive on the receiving thread; everything else on the supervisor's.
     """
 
     def __init__(
@@ -339,7 +340,7 @@ class SessionSamples:
         }
 
     def connected(self, welcome: Welcome) -> None:
-        """Reset the counters and store the vehicle's capabilities, after a proxy has answered Hello."""
+        """Reset the counters and store the vehicle's capabilities after a proxy has answered Hello."""
         state = self._state
         state.welcome = welcome
         state.video.connected(welcome.capabilities.cameras, self._clock())
@@ -349,7 +350,7 @@ class SessionSamples:
         state.on_welcome.publish(welcome)
 
     def link_changed(self, state: LinkState, reason: str) -> None:
-        """Publish the state of the hop to the proxy, along with an event."""
+        """Publish the state of the link to the proxy, together with an event."""
         severity = Severity.INFO if state in (LinkState.UP, LinkState.CLOSED) else Severity.WARNING
         text = f"link to the proxy: {state.value}" + (f" ({reason})" if reason else "")
         self._state.set_status(replace(self._state.status, application=state, reason=reason))
@@ -361,17 +362,18 @@ class SessionSamples:
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
-        """Store and publish a feedback sample, then update the statistics, the authority and the link's state."""
+        """Store and publish a feedback sample; then update the statistics, the authority and the link's state."""
         state = self._state
         before = state.newest
         state.history.add(sample)
         state.newest = sample
         state.received_ns = now_ns
-        # A failsafe or another owner clears the set-point, but no command that a listener sends because of this sample.
+        # A failsafe or another owner clears the set-point, but not a command that a listener sends in response to this
+        # sample.
         changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
         if changed:
             self._commands.feedback(sample, now_ns)
-        state.on_feedback.publish(sample)  # serve the consumers before the statistics
+        state.on_feedback.publish(sample)  # serve the consumers before updating the statistics
         for channel in state.selected:
             channel.receive(sample)
         state.notifier.notify()
@@ -399,7 +401,7 @@ class SessionSamples:
         self._state.notifier.notify()
 
     def _applied(self, applied: Applied, now_ns: int) -> None:
-        """Publish the echo of a command; if the command is this application's own, measure its delay."""
+        """Publish the echo of a command, and measure its delay if this application sent it."""
         if applied.app_id == self._commands.app_id:
             self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
         self._state.on_command.publish(applied)
@@ -414,7 +416,7 @@ class SessionSamples:
 
 
 def _link_reason(events: Sequence[Event]) -> str:
-    """Return the reason given in the newest event about the vehicle's link; empty if there has been no such event."""
+    """Return the reason given in the newest event about the vehicle's link; empty if there is no such event."""
     found = (event for event in reversed(events) if event.kind is EventKind.VEHICLE_LINK)
     return next((str(event.data.get("reason", "")) or event.text for event in found), "")
 
@@ -424,7 +426,7 @@ def _publishing(channel: Channel[T]) -> Callable[[T, int], None]:
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
-    """Return the predicate for a condition, and its readable name. Raises :class:`UnknownNameError`."""
+    """Return the predicate for a condition, and its human-readable name. Raises :class:`UnknownNameError`."""
     if callable(wanted):
         name = getattr(wanted, "__name__", "<lambda>")
         return wanted, "as wanted" if name == "<lambda>" else name

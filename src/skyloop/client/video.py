@@ -1,4 +1,4 @@
-"""Channels of video: a camera's frames for each request, and encoded streams, decoded on a separate thread."""
+"""Deliver video: a camera's frames for each request, and encoded streams, decoded on a separate thread."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from skyloop.transport.base import Pixels, stream, video
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
-#: Maximum number of frames waiting to be decoded; if decoding is slower, skip to the next key frame.
+#: Maximum number of frames waiting to be decoded. If decoding falls behind, it skips to the next key frame.
 MOST_WAITING: Final = 6
-IDLE_KEPT: Final = 32  #: maximum number of channels of each kind to keep; if there are more, unread ones are forgotten
+IDLE_KEPT: Final = 32  #: maximum number of channels of each kind to keep; beyond this, unread channels are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key frame before requesting it again
 _IDLE_S: Final = 2.0
 _PURPOSE: Final = "reading H.264"
@@ -47,21 +47,21 @@ class VideoOptions(TypedDict, total=False):
 
 
 def usual(camera: str) -> VideoRequest:
-    """Return the default request: JPEG if frames are sent over a network."""
+    """Return the default request: JPEG when frames travel over a network."""
     return VideoRequest(camera, encoding="jpeg")
 
 
 class StreamOptions(TypedDict, total=False):
-    """Options for H.264; without options, frames arrive as encoded by the vehicle itself."""
+    """Options for H.264; without options, frames arrive as the vehicle encoded them."""
 
-    kbit_s: int | None  #: rate at which the proxy encodes, once for all clients with the same request [kbit/s]
-    max_fps: float | None  #: maximum number of frames per second; None: all
-    scale: float  #: factor for width and height, above 0 and up to 1
-    subscriber: str  #: the only subscriber, to whose path the proxy adapts the rate
+    kbit_s: int | None  #: bit rate at which the proxy encodes; equal requests share one encoder [kbit/s]
+    max_fps: float | None  #: maximum number of frames per second; None: no limit
+    scale: float  #: factor for width and height, greater than 0 and at most 1
+    subscriber: str  #: the only subscriber; the proxy adapts the rate to its path
 
 
 class VideoChannel(Channel[Arrival]):
-    """One camera's frames for one request."""
+    """Frames of one camera for one request."""
 
     def __init__(
         self,
@@ -71,20 +71,20 @@ class VideoChannel(Channel[Arrival]):
         history: FeedbackHistory,
         request: VideoRequest | None = None,
     ) -> None:
-        """Create a channel, without consumers, for a request for a camera's frames, by default :func:`usual`."""
+        """Create a channel without consumers for a request for a camera's frames; by default, :func:`usual`."""
         self.camera = camera
         self.request = request or usual(camera.name)
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
-        #: Name in the statistics: the camera's plain topic for the default request, otherwise the topic of the request.
+        #: Name in the statistics: the camera's plain topic for the default request, otherwise the request's topic.
         self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
         self.newest: Arrival | None = None
         self.notifier = scheduler.notifier()  #: notified of each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
-        self.too_old = 0  #: number of frames rejected because of a consumer's ``max_age_s``
+        self.too_old = 0  #: number of frames rejected because they exceeded a consumer's ``max_age_s``
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         chosen = self.request.part is not None or self.request.max_fps is not None
-        #: Selects the frames for this request from the full stream; None if it includes all of them.
+        #: Selects the frames for this request from the full stream; None if the request includes all frames.
         self.filter = FrameFilter(self.request) if chosen else None
         self._read: Arrival | None = None  # the last result of next_frame()
         self._connection = connection
@@ -102,7 +102,7 @@ class VideoChannel(Channel[Arrival]):
         return None if arrival is None else self.picture(arrival)
 
     def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
-        """Decode the frame; return None and count it if it can't be decoded or is older than ``max_age_s`` [s]."""
+        """Decode the frame; if it is damaged or older than ``max_age_s`` [s], count it and return None."""
         if max_age_s is not None and arrival.age_s > max_age_s:
             self.too_old += 1
             return None
@@ -113,9 +113,9 @@ class VideoChannel(Channel[Arrival]):
             return None
 
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool) -> None:
-        """Publish a frame received at ``now_ns``, ignoring duplicates and frames that arrive after a newer one.
+        """Publish a frame received at ``now_ns``; ignore duplicates and frames that arrive after a newer one.
 
-        ``as_asked``: whether the proxy prepared the frame for this request; if not, it is scaled here as needed.
+        ``as_asked``: whether the proxy prepared the frame for this request. If not, it is scaled here if necessary.
         """
         counter = self.counter
         last = counter.last_seq
@@ -123,8 +123,8 @@ class VideoChannel(Channel[Arrival]):
             return  # a duplicate, or older than the newest frame
         offset_ns, scale = self._connection.offset_ns, 1.0 if as_asked else self.request.scale
         arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
-        # Serve the consumers before the statistics. The previous frame is released last, because returning its memory
-        # to the proxy takes longer than everything else here.
+        # Serve the consumers before updating the statistics. The previous frame is released last, because returning its
+        # memory to the proxy takes longer than all other steps.
         before, self.newest = self.newest, arrival
         self.publish(arrival)
         self.notifier.notify()
@@ -143,7 +143,7 @@ class VideoChannel(Channel[Arrival]):
         return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
 
     def _period_s(self, fps: float) -> float:
-        """Return the expected time between two frames of this request [s]; 0 if unknown."""
+        """Return the expected time between two frames for this request [s]; 0 if unknown."""
         most = self.request.max_fps
         rate = min(fps, most) if fps > 0.0 and most is not None else fps or most or 0.0
         parts = 1 if self.request.part is None else self.request.part[1]
@@ -151,7 +151,7 @@ class VideoChannel(Channel[Arrival]):
 
 
 class StreamChannel(Channel[EncodedFrame]):
-    """Delivers the complete frames of one stream in order of arrival; some may be missing."""
+    """Delivers the complete frames of one stream in order of arrival; frames may be missing."""
 
     def __init__(self, topic: str, connection: ProxyConnection, clock: Clock) -> None:
         super().__init__(lambda on: connection.subscribe(topic, on))
@@ -159,7 +159,7 @@ class StreamChannel(Channel[EncodedFrame]):
         self.decoder: StreamDecoder | None = None  #: decodes frames for consumers that need images
         self._connection = connection
         self._clock = clock
-        self._encoded_here = "?" in topic  # whether the proxy encodes the stream, so it needs reports of arrivals
+        self._encoded_here = "?" in topic  # whether the proxy encodes the stream and needs reports of arrivals
         self._pieces = Pieces()
         self._asked_ns = -ASK_AGAIN_NS
 
@@ -168,14 +168,14 @@ class StreamChannel(Channel[EncodedFrame]):
         picture = self._pieces.add(part)
         if picture is None:
             return
-        if self.decoder is not None and self._connection.variants:  # otherwise frames arrive unchanged
+        if self.decoder is not None and self._connection.variants:  # without variants, frames arrive unchanged
             self.decoder.put(picture)
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
-        """Report the newest frame to the proxy, which uses these reports to adapt its rate to the path. Thread-safe.
+        """Report the newest frame to the proxy, which adapts its rate to the path accordingly. Thread-safe.
 
-        ``wants_key``: a missing frame prevents decoding; such requests are limited to a few a second.
+        ``wants_key``: whether a missing frame prevents decoding; such reports are limited to a few a second.
         """
         if not self._encoded_here:
             return
@@ -188,15 +188,15 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream in its own thread, in order. After an undecodable frame, skips to the next key frame.
+    """Decodes one stream, in order, in a thread of its own. After an undecodable frame, it skips to the next key frame.
 
-    ``deliver`` is called on that thread with each image: its header, its pixels in BGR, and its arrival time [ns].
+    ``deliver`` is called on that thread with each image's header, pixels (BGR) and arrival time [ns].
     """
 
     def __init__(
         self, stream: StreamChannel, deliver: Callable[[FrameHeader, Pixels, int], None], clock: Clock, name: str
     ) -> None:
-        self.dropped = 0  #: received frames that were not shown because of a gap, damage, or too many at once
+        self.dropped = 0  #: number of frames not shown because of a gap, damage, or too many frames at once
         self._stream = stream
         self._deliver = deliver
         self._clock = clock
@@ -208,7 +208,7 @@ class StreamDecoder:
         self._context: VideoCodecContext | None = None
 
     def put(self, picture: EncodedFrame) -> None:
-        """Queue an encoded frame, on the receiving thread."""
+        """Queue an encoded frame; called on the receiving thread."""
         with self._changed:
             follows = picture.codec == H264 and self._chain.follows(picture.seq, key=picture.key)
             if picture.key:  # earlier frames are no longer needed
@@ -245,11 +245,11 @@ class StreamDecoder:
         with self._changed:
             if self._changed.wait_for(lambda: bool(self._waiting), _IDLE_S):
                 return self._waiting.popleft()
-            self._running = False  # frames after a pause still continue the stream, so keep the decoder
+            self._running = False  # the stream may continue after a pause, so keep the decoder
             return None
 
     def _leave_out(self) -> None:
-        """Skip a damaged frame and all frames that refer to it."""
+        """Skip a damaged frame and all frames that depend on it."""
         with self._changed:
             self.dropped += 1
             while self._waiting and not self._waiting[0][0].key:
@@ -259,7 +259,7 @@ class StreamDecoder:
                 self._chain.restart()
 
     def _decode(self, picture: EncodedFrame) -> Pixels | None:
-        """Return the image, BGR; None if it is damaged."""
+        """Return the image in BGR; None if it is damaged."""
         import av
 
         if self._context is None or picture.key:
@@ -277,17 +277,17 @@ class StreamDecoder:
 
 
 class VideoChannels:
-    """The channels of all cameras and their streams. Thread-safe; video arrives on the receiving thread."""
+    """Channels of all cameras and their streams. Thread-safe; video arrives on the receiving thread."""
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
         self.channels: dict[str, VideoChannel] = {}  #: channels for the default request, by camera
         self.variants: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
-        self.subscriber = secrets.token_hex(8)  #: identifies the streams whose rate is adapted to this client's path
+        self.subscriber = secrets.token_hex(8)  #: identifies streams whose rate is adapted to the path of this client
         self._connection = connection
         self._scheduler = scheduler
         self._history = history
-        self._making = threading.RLock()  # so that two threads that request the same channel get the same one
+        self._making = threading.RLock()  # ensures that two threads requesting the same channel get the same object
 
     def channel(  # written out: a misspelt limit on a frame's age must be a TypeError
         self,
@@ -303,7 +303,7 @@ class VideoChannels:
     ) -> VideoChannel:
         """Return the channel of a camera's frames as requested; see :meth:`skyloop.Drone.frames`.
 
-        ``max_age_s`` is only validated here: the consumer passes it to :meth:`VideoChannel.picture`. Also raises
+        ``max_age_s`` is only validated here; the consumer passes it to :meth:`VideoChannel.picture`. Also raises
         :class:`MissingExtraError` if H.264 is requested and PyAV is not installed.
         """
         self._connection.check_open()
@@ -335,7 +335,7 @@ class VideoChannels:
         return self._made_stream(VideoRequest(self.channel(camera).camera.name, encoding="h264", **how))
 
     def made(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
-        """Return the channel of a camera's frames as requested (None: :func:`usual`), creating it on the first call."""
+        """Return the channel of a camera's frames as requested (None: :func:`usual`); create it on the first call."""
         topic = (request or usual(camera.name)).topic
         with self._making:
             channel = self.variants.get(topic)
@@ -351,7 +351,7 @@ class VideoChannels:
         return channel
 
     def _made_stream(self, request: VideoRequest) -> StreamChannel:
-        """Return the channel of an encoded stream, created on the first call; ``request`` has ``encoding="h264"``."""
+        """Return the channel of an encoded stream; create it on the first call. ``request`` has ``encoding="h264"``."""
         topic = request.stream_topic
         with self._making:
             channel = self.streams.get(topic)
@@ -365,11 +365,11 @@ class VideoChannels:
         """Store the cameras of a newly connected proxy, which may count its frames from 0."""
         for channel in tuple(self.variants.values()):
             channel.restart(now_ns)
-        # The proxy may have restarted with other cameras, and a different one may be the first.
+        # The proxy may have restarted with different cameras, and its first camera may be a different one.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
-        """Resubscribe to cameras that have stalled while other samples are arriving (``flows``)."""
+        """Resubscribe to cameras that have stalled while other samples still arrive (``flows``)."""
         for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
@@ -377,7 +377,7 @@ class VideoChannels:
     def receive(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
         """Deliver a frame to its channels.
 
-        ``topic`` is the request that the frame answers; empty: a plain frame of the camera, for all its channels.
+        ``topic`` names the request that the frame answers; empty: a plain frame of the camera, for all its channels.
         """
         if topic:
             channel = self.variants.get(topic)
@@ -397,7 +397,7 @@ class VideoChannels:
 
 
 def forget_idle(channels: dict[Any, Any], keep: Collection[Channel[Any] | None] = ()) -> None:
-    """Forget the oldest unread channels to make room for one more."""
+    """Forget the oldest unread channels to make room for one new channel."""
     for name, channel in list(channels.items()):
         if len(channels) < IDLE_KEPT:
             return

@@ -1,8 +1,8 @@
-"""The contract between the proxy and a vehicle's driver. ``docs/drivers.md`` shows how to write one.
+"""Define the contract between the proxy and a vehicle's driver. ``docs/drivers.md`` explains how to write one.
 
-A driver speaks the native protocol of one vehicle family and knows nothing about the network, applications or
-authority. It converts units and axes at its edge: everything above it uses SI units and body axes x forward, y left, z
-up. Its class is registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
+A driver implements the native protocol of one vehicle family and knows nothing about networks, applications or
+authority. It converts units and axes: everything above it uses SI units and the body axes x forward, y left, z up. Its
+class is registered in the entry-point group ``skyloop.drivers``; the name of the entry is its URI scheme.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ from skyloop.messages.parameter import Diagnostic
 class Sink(Protocol):
     """Receives a driver's feedback, frames, link states and events.
 
-    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is on the clock of
-    ``time.monotonic_ns`` on this host.
+    Any thread may call any method; all methods return quickly and never raise. Every ``captured_ns`` is a time on this
+    host's ``time.monotonic_ns``.
     """
 
     def feedback(self, feedback: Feedback) -> None:
         """Publish the vehicle's newest state.
 
         Args:
-            feedback: The state, with the vehicle's block of fields filled in. The proxy's fields (``seq``,
-                ``published_ns``, ``lease``, ``owner``, …) keep their defaults. Unknown numbers are None, never NaN.
+            feedback: The state; the driver fills in the vehicle's block of fields. The proxy's fields (``seq``,
+                ``published_ns``, ``lease``, ``owner``, …) stay at their defaults. Unknown numbers are None, never NaN.
         """
 
     def frame(
@@ -70,23 +70,24 @@ class Sink(Protocol):
         """Publish a complete frame.
 
         Args:
-            camera: A name from :meth:`Driver.capabilities`.
-            pixels: C-contiguous uint8 array, which may be reused after the call. Raw encodings have exactly
-                ``height * width * channels`` bytes; JPEG is one file.
-            captured_ns: When the frame was captured, on this host's monotonic clock.
-            width: Width [px].
-            height: Height [px].
+            camera: Name of a camera in :meth:`Driver.capabilities`.
+            pixels: C-contiguous uint8 array; the driver may reuse it after the call. Raw encodings need exactly
+                ``height * width * channels`` bytes; a JPEG is one file.
+            captured_ns: Time of capture, on this host's monotonic clock.
+            width: Width of the image [px].
+            height: Height of the image [px].
             encoding: Encoding of ``pixels``.
-            intrinsics: Intrinsics for this size; None if unknown.
+            intrinsics: Intrinsics for this image size; None if unknown.
         """
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera's frames are currently used. If not, a driver need not decode them."""
+        """Return whether anything currently uses this camera's frames. If not, the driver need not decode them."""
 
     def wanted_fps(self, camera: str) -> float:
-        """Return the highest rate, in frames per second, at which any consumer currently uses this camera's frames.
+        """Return the highest rate at which any consumer currently uses this camera's frames [frames/s].
 
-        0 means none, infinity means all. If frames are expensive, a driver may skip those beyond this rate.
+        0 means that no consumer uses them; infinity means that all frames are used. If frames are expensive, a driver
+        may skip frames beyond this rate.
         """
 
     def stream(
@@ -100,15 +101,15 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a frame as encoded by the vehicle, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a frame as the vehicle encoded it, for a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        Size, time and intrinsics are the same as those of the decoded frame. While frames are in use, the decoded frame
-        is also passed to :meth:`frame`.
+        The size, time and intrinsics are those of the decoded frame. While anything uses frames, the driver also passes
+        the decoded frame to :meth:`frame`.
 
         Args:
             camera: A name from :meth:`Driver.capabilities`.
-            data: One undamaged H.264 access unit in Annex B format, from a stream without B-frames. Key frames
-                include SPS and PPS. Any other frame must continue the one passed before it: after a gap, or after a
+            data: One undamaged H.264 access unit in Annex B format. The stream must have no B-frames. Key frames
+                include SPS and PPS. Any other frame must continue the frame passed before it. After a gap, or after a
                 period without receivers, start with a key frame.
             captured_ns: When the frame was captured, on this host's monotonic clock.
             width: Width [px].
@@ -118,15 +119,15 @@ class Sink(Protocol):
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether anyone is currently receiving this camera's encoded frames."""
+        """Return whether anything currently receives this camera's encoded frames."""
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Report a new state of the vehicle link, or a new reason for the current one.
+        """Report a new state of the vehicle link, or a new reason for its current state.
 
         Args:
             state: UP once the vehicle answers.
-            reason: What is being waited for, and the last failure. Shown to every client.
-            remedy: What the user can do about it, as an instruction ("join its Wi-Fi network"). Shown to every client.
+            reason: What the link is waiting for, and the last failure. Shown to every client.
+            remedy: What the user can do about it, as an instruction ("join its Wi-Fi network"). All clients see it.
         """
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
@@ -141,16 +142,16 @@ class Sink(Protocol):
 
 
 class ServedLink(Protocol):
-    """A vehicle link served by a host, whose thread may serve the links of several vehicles."""
+    """A vehicle link served by a host; one thread of the host may serve the links of several vehicles."""
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when :meth:`serve` must be called."""
 
     def serve(self, *, readable: bool) -> int | None:
-        """Do all pending work without waiting. Errors raised have already been reported; the host retries later.
+        """Do all pending work; never wait. Errors raised here have already been reported; the host retries later.
 
         Args:
-            readable: Whether :meth:`fileno` is readable; if not, the deadline returned last has passed.
+            readable: Whether :meth:`fileno` is readable; if not, the previously returned deadline has passed.
 
         Returns:
             Deadline of the next call, on the monotonic clock [ns]; None: call :meth:`end` instead.
@@ -160,19 +161,19 @@ class ServedLink(Protocol):
         """Release the link's resources."""
 
 
-AHEAD_NS: Final = nanoseconds(0.05)  #: how far in the future a pose may be: accuracy of two hosts' clock offset
+AHEAD_NS: Final = nanoseconds(0.05)  #: maximum lead of a pose's time: the accuracy of two hosts' clock offset
 
 
 @dataclass(frozen=True, slots=True)
 class ExternalPose:
-    """A vehicle's pose as measured from outside, for example by motion capture.
+    """A vehicle's pose measured from outside, for example by motion capture.
 
-    Raises :class:`UsageError` if a number is not finite, a standard deviation is negative, or the quaternion's length
-    differs from 1 by more than 0.001.
+    Raises :class:`UsageError` if a number is not finite, if a standard deviation is negative, or if the quaternion's
+    length differs from 1 by more than 0.001.
     """
 
     position_m: Vector  #: position of the body's origin in world axes, x east, y north, z up [m]
-    quaternion: tuple[float, float, float, float]  #: rotation (x, y, z, w) from body (forward, left, up) to world axes
+    quaternion: tuple[float, float, float, float]  #: rotation (x, y, z, w) from body axes to world axes
     captured_ns: int  #: time of the measurement, on this host's monotonic clock
     position_std_m: float | None = None  #: standard deviation of the position [m], 0 or more; None if unknown
     attitude_std_rad: float | None = None  #: standard deviation of the orientation [rad], 0 or more; None if unknown
@@ -181,9 +182,9 @@ class ExternalPose:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
     def bounded(self, now_ns: int) -> ExternalPose:
-        """Return the pose with its timestamp limited to the present, as drivers require.
+        """Return the pose with its time limited to the present, which drivers require.
 
-        Raises :class:`DriverError` if it is more than 50 ms ahead: the clock is wrong, and all later poses would look
+        Raises :class:`DriverError` if the time is more than 50 ms ahead: its clock is wrong, and later poses would look
         old.
         """
         ahead_ns = self.captured_ns - now_ns
@@ -195,18 +196,18 @@ class ExternalPose:
 class Driver(ABC):
     """Base class for drivers. Owns the life cycle; subclasses implement the abstract methods and, to fly, ``_apply``.
 
-    No I/O happens before :meth:`open`. Times passed to the sink are from ``time.monotonic_ns`` on this host.
-    ``_open(sink)`` starts threads and does not wait, ``_close()`` joins them and clears all set-points, and
-    ``_apply(action)`` implements :meth:`apply`. The attributes ``uri`` and ``_sink`` belong to this class.
+    No I/O happens before :meth:`open`. Times passed to the sink are times of ``time.monotonic_ns`` on this host.
+    ``_open(sink)`` starts threads without waiting, ``_close()`` joins them and clears all set-points, and
+    ``_apply(action)`` implements :meth:`apply`. This class owns the attributes ``uri`` and ``_sink``.
 
     Args:
-        uri: The vehicle's address with its options.
+        uri: Address of the vehicle, including its options.
 
     Attributes:
-        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is considered theirs.
-        parameters_without_authority: Names of parameters that any pilot may write, because they don't affect a flight.
-        serve_link: Set by a host before :meth:`open`, for a thread that serves several vehicles; None: the driver has
-            its own thread.
+        shared: Whether someone else may also fly the vehicle. If so, a vehicle found in the air is considered theirs.
+        parameters_without_authority: Names of parameters that any pilot may write because they don't affect a flight.
+        serve_link: Set by a host before :meth:`open` if one of its threads serves several vehicles; None: the driver
+            uses its own thread.
 
     Raises:
         UsageError: If a subclass does not know an option; see :func:`reject_unknown_options`.
@@ -217,9 +218,9 @@ class Driver(ABC):
     serve_link: Callable[[ServedLink], None] | None = None
 
     def __init__(self, uri: VehicleUri) -> None:
-        """Store the address. Subclasses read their options here, without I/O."""
+        """Store the address. Subclasses read their options here and do no I/O."""
         self.uri = uri
-        self.__lock = threading.Lock()  # name-mangled, because subclasses may have a _lock of their own
+        self.__lock = threading.Lock()  # name-mangled because subclasses may have their own _lock
         self._sink: Sink | None = None
 
     # Abilities ------------------------------------------------------------------------------------------------
@@ -228,13 +229,13 @@ class Driver(ABC):
     def capabilities(self) -> Capabilities:
         """Return the vehicle's capabilities.
 
-        May be called before :meth:`open`. The proxy emulates missing actions in software where possible.
+        May be called before :meth:`open`. Where possible, the proxy emulates missing actions in software.
         """
 
     def parameters(self) -> list[Parameter]:
-        """Return the vehicle's own parameters, as far as they are known yet, with their current values.
+        """Return the vehicle's own parameters that are known so far, with their current values.
 
-        Names are dotted and lower-case. May be called before the vehicle has answered.
+        Names are dotted and in lower case. May be called before the vehicle has answered.
         """
         return []
 
@@ -244,21 +245,21 @@ class Driver(ABC):
         Called on the proxy's request thread; may take up to a second.
 
         Args:
-            name: A name from :meth:`parameters`.
-            value: The value; type and range have been checked against :meth:`parameters`.
+            name: Name of a parameter in :meth:`parameters`.
+            value: The value; its type and range have been checked against :meth:`parameters`.
 
         Returns:
-            The value in force, which the vehicle may have rounded.
+            The new value, which the vehicle may have rounded.
 
         Raises:
-            ParameterError: If the vehicle refuses the value; the message gives its reason.
+            ParameterError: If the vehicle refuses the value; the message gives the reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, sink: Sink) -> None:
-        """Start communicating with the vehicle. Returns at once; the state of the link is reported to the sink.
+        """Start communicating with the vehicle. Returns immediately; the sink receives the state of the link.
 
         An unreachable vehicle is not an error: the driver keeps trying.
 
@@ -266,7 +267,7 @@ class Driver(ABC):
             sink: Receives everything that the vehicle reports, until :meth:`close` returns.
 
         Raises:
-            UsageError: If the driver is already open, or another error occurred that a retry can't fix.
+            UsageError: If the driver is already open, or if another error occurred that a retry can't fix.
             MissingExtraError: If a package that the driver needs is not installed.
         """
         with self.__lock:
@@ -282,7 +283,7 @@ class Driver(ABC):
     def close(self) -> None:
         """Stop threads and release resources. Idempotent.
 
-        Does not land the vehicle, because the proxy has already done so. The sink is not called after this returns.
+        Does not land the vehicle; the proxy has already done so. After this returns, the sink is no longer called.
         """
         with self.__lock:
             was_open, self._sink = self._sink is not None, None
@@ -294,57 +295,56 @@ class Driver(ABC):
     def apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:
         """Execute an action until the next call.
 
-        Must not block for more than a few milliseconds. The proxy makes one call at a time, only with actions in
-        :meth:`capabilities`, and with finite numbers.
+        Must not block for more than a few milliseconds. The proxy makes one call at a time, only with actions listed in
+        :meth:`capabilities`, and only with finite numbers.
 
         Args:
-            action: A set-point or a one-time action. If there is no telemetry, a take-off is refused rather than
-                postponed.
-            new: Whether it is a new request from an application. If not, the library repeats or continues an earlier
+            action: A set-point or a one-time action. Without telemetry, a take-off is refused rather than postponed.
+            new: Whether this is a new request from an application. If not, the library repeats or continues an earlier
                 request, which must not take the vehicle back from another controller.
 
         Returns:
             The action as limited by the vehicle.
 
         Raises:
-            DriverError: If the vehicle can't execute it; the message is shown to users.
+            DriverError: If the vehicle can't execute the action; the message is shown to users.
         """
         return self._apply(action) if new else self._repeat(action)
 
     def check(self, action: AnyAction) -> None:  # noqa: B027  most vehicles refuse nothing
-        """Refuse a request to the software autopilot that the vehicle would certainly not obey.
+        """Refuse a request to the software autopilot that the vehicle would certainly not follow.
 
-        Called before the software autopilot starts an action that the vehicle does not support itself. For example, a
-        vehicle that can't be armed refuses the take-off. Returns at once.
+        Called before the software autopilot starts an action that the vehicle itself does not support. For example, a
+        vehicle that can't be armed refuses the take-off. Returns immediately.
 
         Args:
             action: Take-off, hover, land, velocity or position.
 
         Raises:
-            DriverError: If the vehicle would not obey it; the message is shown to users.
+            DriverError: If the vehicle would not follow the request; the message is shown to users.
         """
 
     def left_to(self) -> str:
-        """Return what others have made the vehicle do since our last command, such as ``RTL``.
+        """Return what others have made the vehicle do since the driver's last command, such as ``RTL``.
 
-        Override this if the vehicle reports such changes. The proxy calls it several times a second. A vehicle flown
-        by others is left alone until a new action takes it over. Thread-safe; returns at once.
+        Override this if the vehicle reports such changes. The proxy calls this several times a second. A vehicle that
+        someone else flies is left alone until a new action takes it over. Thread-safe; returns immediately.
 
         Returns:
-            The driver's name for it; empty if others have done nothing.
+            The driver's name for what they did; empty if they did nothing.
         """
         return ""
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action while no pilot is in command. Never raises.
+        """Apply an action while no pilot commands the vehicle. Never raises.
 
         The driver reports a failure as an event, and the proxy retries.
 
         Args:
-            action: Hover or land.
+            action: A hover or a landing.
 
         Returns:
-            Whether the driver accepted it.
+            Whether the driver accepted the action.
         """
         sink = self._sink
         try:
@@ -358,24 +358,23 @@ class Driver(ABC):
     # Abilities of some vehicles --------------------------------------------------------------------------------------
 
     def external_pose(self, pose: ExternalPose) -> None:  # noqa: ARG002
-        """Send the vehicle its own pose from motion capture, for flight without GPS.
+        """Send the vehicle its own pose as measured by motion capture, for flight without GPS.
 
         Thread-safe; returns at once.
 
         Args:
-            pose: Position and orientation in world axes.
+            pose: Position and orientation of the vehicle in world axes.
 
         Raises:
             UnsupportedError: If the vehicle does not accept external poses.
-            DriverError: If the pose can't be sent at present.
+            DriverError: If the pose can't be sent now.
         """
         raise UnsupportedError(f"{self.uri.scheme}:// does not accept external poses")
 
     def checkup(self) -> list[Diagnostic]:
-        """Return findings about the vehicle and its settings that need attention before flying.
+        """Return findings about the vehicle and its settings that need attention before a flight.
 
-        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` show them. Called while the driver is open, from any
-        thread; returns at once.
+        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` display them. Called on any thread; returns immediately.
         """
         return []
 
@@ -391,26 +390,26 @@ class Driver(ABC):
         raise UsageError(f"{self.uri.scheme} does not support {action.name}")
 
     def _repeat(self, action: AnyAction) -> AnyAction:
-        """Apply a repeat; see :meth:`apply`. Override this if others may fly the vehicle, too."""
+        """Apply a repeated action; see :meth:`apply`. Override this if someone else may also fly the vehicle."""
         return self._apply(action)
 
     def _alone(self, action: Hover | Land) -> AnyAction:
-        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it must differ from a pilot's request."""
+        """Apply a failsafe's action; see :meth:`failsafe`. Override this if it must differ from a pilot's action."""
         return self._apply(action)
 
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise :class:`UnknownNameError` for the first of the URI's options that is not in ``known``."""
+    """Raise :class:`UnknownNameError` for the first option of the URI that is not in ``known``."""
     for name in uri.options:
         if name not in known:
             raise UnknownNameError(f"option of {uri.scheme}://", name, known)
 
 
 def checked_value(parameter: Parameter, value: Value) -> Value:
-    """Check a new value for a scalar parameter; return it, converted to float if the parameter is a float.
+    """Check a new value for a scalar parameter and return it; the value for a float parameter is converted to float.
 
     Raises:
-        ParameterError: If the value is of the wrong type, out of range, or not one of the choices.
+        ParameterError: If the value has the wrong type, is out of range, or is not one of the choices.
     """
     name, kind = parameter.name, parameter.type
     if kind in (ParameterType.FLOAT, ParameterType.INT) and not parameter.choices:

@@ -1,4 +1,4 @@
-"""Ordered byte connections that never block: TCP and serial ports."""
+"""Transfer bytes in order over connections that never block: TCP and serial ports."""
 
 from __future__ import annotations
 
@@ -18,55 +18,56 @@ from skyloop.errors import MissingExtraError
 from skyloop.files import wait_readable
 
 CONNECT_S: Final = 1.0
-STUCK_NS: Final = nanoseconds(0.5)  #: a connection whose buffer stays full for this long is considered dead
+STUCK_NS: Final = nanoseconds(0.5)  #: time after which a connection with a full buffer is considered dead
 _READ_BYTES: Final = 65_536  # maximum number of bytes per read
-_BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including the start and stop bits
-_DRAIN_S: Final = 0.1  # time limit for closing a connection before a new one is opened
-END_S: Final = 0.5  #: the same for the final close, because TCP resends a lost packet after 0.2 s
-_UNACKNOWLEDGED_MS: Final = 2500  # age of unacknowledged data at which TCP is closed, to discard them
-_OVERDUE_NS: Final = nanoseconds(0.1)  # a line has stalled if bytes are still unsent this long after their due time
-_TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and has resent lost packets by then
-#: Size of the longest frame in MAVLink and MSP [bytes]. A flight controller's parser consumes as many bytes as a frame
-#: announces without looking for another frame in them, so a possibly incomplete frame is padded before a stop is sent.
+_BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including start and stop bits
+_DRAIN_S: Final = 0.1  # time limit for closing one connection before opening the next
+END_S: Final = 0.5  #: time limit for the last close; TCP resends a lost packet after 0.2 s
+_UNACKNOWLEDGED_MS: Final = 2500  # time without acknowledgement after which TCP drops the connection
+_OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes are unsent this long after they were due
+_TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and by then has resent lost packets
+#: Size of the longest frame in MAVLink and MSP [bytes]. The parser of a flight controller consumes as many bytes as a
+#: frame announces without looking for another frame in them. A frame that may be incomplete is therefore padded before
+#: a stop is sent.
 _LONGEST: Final = 280
 
 
 class Rank(IntEnum):
-    """Priority of a packet. The first rank is always sent at once, the last only when the line is idle."""
+    """Priority of a packet. STOP is always sent immediately, the last rank only when the line is idle."""
 
     STOP = 0  #: emergency stops, which empty the output buffer of a serial port
-    COMMAND = 1  #: modes and arming, which are rare, small and never held back
+    COMMAND = 1  #: modes and arming: rare and small packets that are never held back
     SETPOINT = 2
     QUERY = 3  #: requests, parameters
-    POSE = 4  #: external poses, which are frequent and large
+    POSE = 4  #: external poses: frequent and large packets
 
 
-#: Maximum backlog of the line at which packets of a rank are still sent [ns].
+#: Maximum backlog of the line at which a packet of each rank is still sent [ns].
 _PATIENCE_NS: Final = {Rank.SETPOINT: nanoseconds(0.1), Rank.QUERY: nanoseconds(0.06), Rank.POSE: nanoseconds(0.02)}
 
 
 class LinePace:
-    """Estimates the backlog of a line, so that packets can be held back rather than arrive late. Pure.
+    """Estimates the backlog of a line; packets can then be held back rather than arrive late. Pure.
 
     Args:
-        bytes_per_s: Speed of the line; None if the line is never a bottleneck.
+        bytes_per_s: Speed of the line; None if the line never limits the rate.
         overdue_ns: How late written bytes may be before the line counts as stalled.
     """
 
     def __init__(self, bytes_per_s: float | None, overdue_ns: int = _OVERDUE_NS) -> None:
         self._overdue_ns = overdue_ns
         self._ns_per_byte = 0.0 if bytes_per_s is None else 1e9 / bytes_per_s
-        self._free_ns = 0  # when all bytes written so far will have been sent
+        self._free_ns = 0  # time at which all bytes written so far will have been sent
         self._written = 0  # number of bytes written so far
-        self._mark = 0  # how many of these should have been sent by _due_ns
-        self._due_ns: int | None = None  # when those bytes should have been sent; None if there were none
+        self._mark = 0  # how many of these bytes should have been sent by _due_ns
+        self._due_ns: int | None = None  # when those bytes should have been sent; None if there are none
 
     def admits(self, rank: Rank, now_ns: int) -> bool:
-        """Return whether a packet may be sent now; otherwise it would queue behind others and arrive late."""
+        """Return whether a packet may be sent now; if not, it would wait behind others and arrive late."""
         return rank <= Rank.COMMAND or self._free_ns - now_ns <= _PATIENCE_NS[rank]
 
     def stalled(self, now_ns: int) -> bool:
-        """Return whether the line is stuck, judging by how much is left in the output buffer."""
+        """Return whether the line is stuck, judged by the number of bytes left in the output buffer."""
         return self._due_ns is not None and now_ns > self._due_ns
 
     def on_waiting(self, size: int, now_ns: int) -> None:
@@ -89,9 +90,10 @@ _NOT_READ: Final = "the vehicle no longer reads what we send"
 class ByteStream(ABC):
     """An open connection. Not thread-safe.
 
-    ``dropped`` counts packets that were not sent because the line lagged, was stalled, or had no room. Drivers repeat
-    each of these packets or send a newer one. Buffers at the far end, and those of pseudo-terminals (which the system
-    reports as empty), are not visible here, so sessions hold set-points back while they receive nothing.
+    ``dropped`` counts packets that were not sent because the line had a backlog, was stalled, or had no room. Drivers
+    repeat each of these packets or send a newer packet instead. Buffers at the far end, and buffers of pseudo-terminals
+    (which the system reports as empty), can't be seen here. Sessions therefore send no set-points while they receive
+    nothing.
     """
 
     def __init__(self, pace: LinePace, clock: Clock) -> None:
@@ -100,11 +102,11 @@ class ByteStream(ABC):
         self._pace = pace
         self._clock = clock
         self._stuck_ns = STUCK_NS
-        self._full_ns: int | None = None  # when the buffer became full, or the line stalled
-        self._whole = _LONGEST  # number of bytes written since a frame may have been cut
-        self._rest = b""  # end of a frame that was only partly written, altered so that the receiver discards it
-        self._cleared = False  # a full buffer was emptied for a stop, and nothing shows yet that it is being read again
-        self._after_stop = 1 << 62  # bytes written since a stop; if at most this many are waiting, the stop has left
+        self._full_ns: int | None = None  # when the buffer became full or the line stalled
+        self._whole = _LONGEST  # number of bytes written since a frame may have been cut off
+        self._rest = b""  # end of a partly written frame, altered to make the receiver discard the frame
+        self._cleared = False  # a full buffer was emptied for a stop, and is not known to be read again yet
+        self._after_stop = 1 << 62  # bytes written since a stop; if no more than this are waiting, the stop was sent
 
     @abstractmethod
     def fileno(self) -> int:
@@ -112,16 +114,16 @@ class ByteStream(ABC):
 
     @abstractmethod
     def read(self) -> bytes:
-        """Return the bytes received so far, which may be none. Raises ``OSError`` if the connection has ended."""
+        """Return the bytes received so far, possibly none. Raises ``OSError`` if the connection has ended."""
 
     def write(self, data: bytes, rank: Rank = Rank.SETPOINT) -> None:
         """Send a packet, or drop it if there is no room or the line has a backlog. Never waits.
 
-        Raises ``OSError`` if sending fails, or if no whole packet could be sent for :data:`STUCK_NS`.
+        Raises ``OSError`` if sending fails, or if no complete packet could be sent for :data:`STUCK_NS`.
         """
         now_ns, waiting, stop = self._clock(), self._waiting(), rank is Rank.STOP
         self._pace.on_waiting(waiting, now_ns)
-        if stop and _LONGEST < waiting <= self._after_stop:  # if less is waiting, padding takes just as long
+        if stop and _LONGEST < waiting <= self._after_stop:  # with fewer bytes waiting, padding takes just as long
             self._discard()
         stalled = self._cleared or self._pace.stalled(now_ns)
         sent, whole = 0, False
@@ -145,11 +147,11 @@ class ByteStream(ABC):
         self._check_room(now_ns, room=whole and not stalled)
 
     def _rest_of(self, packet: bytes, sent: int) -> bytes:
-        """Return the bytes to write before the next packet: the end of a frame whose start was sent.
+        """Return the bytes to write before the next packet: the end of a frame that was only partly sent.
 
-        That frame is out of date. Its last byte, part of a checksum, is inverted so that the receiver discards it;
-        without the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores
-        signatures still executes a signed frame if only its signature was cut.)
+        That frame is outdated. Its last byte, part of a checksum, is inverted to make the receiver discard the frame.
+        Without the end, the receiver would mistake the next packet for the missing part. (A vehicle that ignores
+        signatures still executes a signed frame if only the signature was cut off.)
         """
         if sent <= len(self._rest):
             return self._rest[sent:]
@@ -177,13 +179,13 @@ class ByteStream(ABC):
         return 0
 
     def _discard(self) -> bool:
-        """Empty the output buffer, which may cut off a frame; return whether this worked, as far as is known."""
+        """Empty the output buffer, which may cut off a frame; return whether this appears to have worked."""
         return False
 
     def _drain(self) -> bool:
-        """Wait briefly for written bytes to be sent; return whether they have been."""
+        """Wait briefly until written bytes have been sent; return whether they have."""
         until_s = time.monotonic() + self.drain_s
-        # On a stuck line, only a stop is worth waiting for: it may still be sent since the buffer was emptied for it.
+        # On a stuck line, only a stop is worth waiting for: it may have been sent after the buffer was emptied for it.
         patient = self._full_ns is None or self._cleared or self._waiting() > self._after_stop
         while patient and (self._waiting() or self._cleared) and time.monotonic() < until_s:
             time.sleep(0.005)
@@ -191,7 +193,7 @@ class ByteStream(ABC):
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
-        """Write as many bytes as fit and return their number; raise BlockingIOError if none fit."""
+        """Write as many bytes as fit and return their number; raise BlockingIOError if there is no room."""
 
     @abstractmethod
     def close(self) -> None:
@@ -199,14 +201,14 @@ class ByteStream(ABC):
 
 
 class TcpStream(ByteStream):
-    """A TCP connection to a numeric address, because a name look-up would block. The server may not be serving yet.
+    """A TCP connection to a numeric address (a name look-up would block). The server need not be running yet.
 
-    Raises ``OSError`` unless the connection is made within :data:`CONNECT_S`.
+    Raises ``OSError`` if the connection is not established within :data:`CONNECT_S`.
     """
 
     def __init__(self, host: str, port: int, clock: Clock = monotonic_ns) -> None:
         super().__init__(LinePace(None, _TCP_OVERDUE_NS), clock)
-        self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # TCP needs 0.6 s for a packet that is lost twice
+        self._stuck_ns = nanoseconds(_UNACKNOWLEDGED_MS / 1000)  # TCP needs 0.6 s for a packet lost twice
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # not available on macOS
@@ -231,27 +233,27 @@ class TcpStream(ByteStream):
         return self._socket.send(data)
 
     def close(self) -> None:
-        """Close the connection and discard unreceived data, which the system would otherwise resend for minutes."""
+        """Close the connection and discard unacknowledged data, which the system would otherwise resend for minutes."""
         if not self._drain():
             with suppress(OSError):
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # the count is unavailable, or the connection is gone
+        with suppress(Exception):  # the count is unavailable, or the connection has ended
             import fcntl
             import termios
 
-            self._socket.getpeername()  # raises if the connection is gone; lost bytes would still count as waiting
+            self._socket.getpeername()  # raises if the connection has ended: lost bytes would still be counted
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
 
 
 class SerialStream(ByteStream):
-    """A serial port, opened with pyserial for exclusive use and with an empty output buffer.
+    """A serial port, opened for exclusive use with pyserial; its output buffer is emptied first.
 
-    Raises ``OSError`` if it can't be opened, and :class:`MissingExtraError` if pyserial is missing.
+    Raises ``OSError`` if the port can't be opened, and :class:`MissingExtraError` if pyserial is not installed.
     """
 
     def __init__(self, path: str, baud: int, what: str, extra: str, clock: Clock = monotonic_ns) -> None:
@@ -262,7 +264,7 @@ class SerialStream(ByteStream):
         super().__init__(LinePace(line_speed(path, baud)), clock)
         self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         self._discard()
-        self._whole = 0  # the previous connection may have left a frame incomplete
+        self._whole = 0  # the previous connection may have left an incomplete frame
 
     def fileno(self) -> int:
         """Return the descriptor."""
@@ -279,10 +281,10 @@ class SerialStream(ByteStream):
         return data
 
     def _write(self, data: bytes) -> int:
-        return os.write(self.fileno(), data)  # pyserial's write() keeps retrying while there is no room
+        return os.write(self.fileno(), data)  # pyserial's write() retries while there is no room
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # unavailable, or the port is gone, which write() reports
+        with suppress(Exception):  # unavailable, or the port has disappeared, which write() reports
             waiting: int = self._port.out_waiting
             return waiting
         return 0
@@ -291,13 +293,13 @@ class SerialStream(ByteStream):
         before = self._waiting()
         with suppress(Exception):  # termios.error is not an OSError
             self._port.reset_output_buffer()
-            if not before or self._waiting() < before:  # some port drivers can't empty it
+            if not before or self._waiting() < before:  # some port drivers can't empty the buffer
                 self._whole, self._rest = 0, b""
                 return True
         return False
 
     def close(self) -> None:
-        """Close the port and discard unread data; otherwise the system would wait for it, on some ports for 30 s."""
+        """Close the port and discard unsent data, which the system would otherwise wait to send, sometimes for 30 s."""
         if not self._drain():
             self._discard()
         self._port.close()

@@ -1,6 +1,6 @@
-"""The parts of H.264 needed to separate frames and to detect missing, reordered or resized ones. Pure.
+"""Parse the parts of H.264 needed to separate frames and detect missing, reordered or resized frames. Pure.
 
-ITU-T H.264: 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annex B, Annex E.
+ITU-T H.264: sections 7.3 and 7.4 (units, parameter sets, slice headers), 7.4.3 (picture numbers), Annexes B and E.
 """
 
 from __future__ import annotations
@@ -13,27 +13,27 @@ from skyloop.errors import DecodeError
 
 SLICE, IDR, SPS, PPS = 1, 5, 7, 8  #: types of NAL units
 START: Final = b"\0\0\0\1"
-MAX_SETS: Final = 8  #: maximum number of parameter sets of each kind to store; cameras send one
+MAX_SETS: Final = 8  #: maximum number of parameter sets of each kind to store; cameras send one set
 _ANY_START: Final = re.compile(rb"\x00\x00\x01")
-_HEADER_BYTES: Final = 32  # enough for the start of a slice header
-_SET_BYTES: Final = 512  # enough for a sequence parameter set, including scaling lists
+_HEADER_BYTES: Final = 32  # number of bytes that suffice for the start of a slice header
+_SET_BYTES: Final = 512  # number of bytes that suffice for a sequence parameter set with scaling lists
 _CHROMA_PROFILES: Final = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128})
 _ALL_COLOURS: Final = 3  # chroma_format_idc for 4:4:4
-_MAX_BLOCKS: Final = 1024  # maximum number of macroblocks per side, 16384 pixels
+_MAX_BLOCKS: Final = 1024  # maximum number of macroblocks per side (16384 pixels)
 _MAX_CYCLE: Final = 255
 _B: Final = 1  # slice_type of B slices, modulo 5
 
 
 @dataclass(frozen=True, slots=True)
 class Sequence:
-    """The relevant fields of a sequence parameter set."""
+    """The fields of a sequence parameter set that this module uses."""
 
     frame_number_bits: int
     width: int  #: width of the displayed image [px]
     height: int
     interlaced: bool = False  #: whether pictures may be fields
     colour_planes: bool = False  #: whether the colour planes are encoded separately
-    gaps_allowed: bool = False  #: whether the sender may skip frames, so that their numbers have gaps
+    gaps_allowed: bool = False  #: whether the sender may skip frames and thereby leave gaps in their numbers
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +44,11 @@ class Slice:
     is_first: bool  #: whether it is the first slice of its frame
     is_reference: bool
     frame_number: int
-    is_b: bool = False  #: whether it may refer to later frames
+    is_b: bool = False  #: whether it may depend on later frames
 
 
 def units(stream: bytes) -> list[bytes]:
-    """Split stream data in Annex B format into its NAL units. Bytes before the first start code are skipped."""
+    """Split data of a stream in Annex B format into its NAL units. Bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -102,7 +102,7 @@ def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
     bits = _Bits(unit[1:_HEADER_BYTES])
     first = bits.exp_golomb()
     kind = bits.exp_golomb()
-    bits.exp_golomb()  # number of the parameter set
+    bits.exp_golomb()  # number of its parameter set
     if sequence.colour_planes:
         bits.take(2)
     number = bits.take(sequence.frame_number_bits)
@@ -110,7 +110,7 @@ def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
 
 
 def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
-    """Return how many reference frames are missing between two consecutive ones, according to their numbers (7.4.3)."""
+    """Return how many reference frames are missing between two received ones, according to their numbers (7.4.3)."""
     if now.is_key:
         return 0
     turns = 1 << sequence.frame_number_bits
@@ -118,7 +118,7 @@ def missing_between(before: Slice, now: Slice, sequence: Sequence) -> int:
 
 
 def _skip_order(bits: _Bits) -> None:
-    """Skip the fields of the picture order count, of which there are three types."""
+    """Skip the fields of the picture order count, which has three types."""
     kind = bits.exp_golomb()
     if kind == 0:
         bits.exp_golomb()
@@ -165,24 +165,24 @@ class _Bits:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """An access unit with the inspector's findings."""
+    """An access unit with the findings of the inspector."""
 
     data: bytes  #: the unit in Annex B format; if it is a key frame, it includes the parameter sets
-    is_key: bool  #: whether decoding can start here: it is an IDR picture with known parameter sets
-    after_gap: bool  #: whether frames are missing before this one, or it is the first
+    is_key: bool  #: whether decoding can start here: an IDR picture with known parameter sets
+    after_gap: bool  #: whether frames are missing before this one, or it is the first frame
     width: int  #: width [px]
     height: int
-    reason: str = ""  #: why frames of this stream can't be forwarded without decoding; empty if they can
+    reason: str = ""  #: why frames of this stream can't be forwarded without decoding; empty if they can be
 
 
 class Inspector:
-    """Inspects the access units of one stream in order, without decoding them.
+    """Inspects the access units of a stream in order, without decoding them.
 
-    It remembers parameter sets, which a stream may send only once, and puts them in front of each key frame. If a
-    stream has several sequence parameter sets, the last one is used.
+    It stores parameter sets, which a stream may send only once, and puts them in front of each key frame. If a stream
+    has several sequence parameter sets, the last set is used.
 
     Args:
-        parameters: Parameter sets obtained outside the stream (from SDP or a container), in Annex B format.
+        parameters: Parameter sets from outside the stream (from SDP or a container), in Annex B format.
     """
 
     def __init__(self, parameters: bytes = b"") -> None:
@@ -195,8 +195,8 @@ class Inspector:
     def inspect(self, data: bytes) -> Unit | None:
         """Inspect the next access unit, in Annex B format.
 
-        Returns None if the unit holds no picture, or if its headers are damaged or unknown; the unit after it is then
-        marked as following a gap.
+        Returns None if the unit contains no picture, or if its headers are damaged or unknown. The next unit then
+        counts as following a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}
@@ -222,7 +222,7 @@ class Inspector:
         return Unit(data, is_key, gap, self._sequence.width, self._sequence.height, self._reason(heads))
 
     def restart(self) -> None:
-        """Record that frames were skipped, so that the next one does not continue the last one."""
+        """Record that frames were skipped: the next frame does not continue the last one."""
         self._before = None
 
     def _is_missing(self, before: Slice, now: Slice) -> bool:
@@ -243,7 +243,7 @@ class Inspector:
             try:
                 sequence = parse_sequence(unit)
             except DecodeError:
-                return  # the parameter set is damaged; keep the previous one and leave it to the decoder
+                return  # the parameter set is damaged: keep the previous set and leave the damaged one to the decoder
             if sequence != self._sequence:
                 self._sequence, self._before = sequence, None
                 for known in self._sets.values():
@@ -256,7 +256,7 @@ class Inspector:
 
 
 def _set_number(unit: bytes) -> bytes:
-    """Return the number of a parameter set, which identifies it."""
+    """Return the number that identifies a parameter set."""
     bits = _Bits(unit[4 if unit_type(unit) == SPS else 1 :][:_HEADER_BYTES])
     try:
         return bytes([bits.exp_golomb() % 256])

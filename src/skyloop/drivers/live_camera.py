@@ -1,7 +1,7 @@
-"""A network camera, or a camera device of this machine: its options in a vehicle's address, and its live video.
+"""Read a network camera or a camera device of this machine: its options in a vehicle's address, and its live video.
 
-The video source is the address of a stream or a device, which FFmpeg opens. The intrinsics are given by
-``calibration``, the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and
+The video source is the address of a stream or the path of a device, opened by FFmpeg. The intrinsics are given either
+by ``calibration``, the name of a calibration file, or by the numbers ``fx``, ``fy``, ``cx``, ``cy`` [px] and
 ``distortion`` (k1, k2, p1, p2[, k3[, k4, k5, k6]]).
 """
 
@@ -28,17 +28,17 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 if TYPE_CHECKING:
     from skyloop.drivers.live_container import ContainerStream
 
-STALLED_S: Final = 1.5  #: a stream that delivers nothing for this long, or for three of its periods, is reopened
-_WHERE: Final = "camera"  # source of the events
-OPEN_S: Final = 5.0  #: time limit for connecting, the handshake and the first frame
+STALLED_S: Final = 1.5  #: time without data, or three frame periods if longer, after which a stream is reopened
+_WHERE: Final = "camera"  # source of the camera's events
+OPEN_S: Final = 5.0  #: time limit for the connection, the handshake and the first frame
 DEVICE_FORMAT: Final = "v4l2"
-RTP_PORT: Final = 5600  #: the default port of PX4, ArduPilot's companion computers and QGroundControl
-_PAYLOAD: Final = 96  # GStreamer's default for rtph264pay and rtph265pay
+RTP_PORT: Final = 5600  #: default port of PX4, ArduPilot's companion computers and QGroundControl
+_PAYLOAD: Final = 96  # GStreamer's default payload type for rtph264pay and rtph265pay
 _RTP_OPTIONS: Final = frozenset({"payload", "codec"})
 _CODECS: Final = {"h264": "H264", "h265": "H265"}
-#: Options that minimise FFmpeg's probing before the first frame, because the frame rate is not needed.
+#: Options that minimise FFmpeg's probing before the first frame; the frame rate is not needed.
 _LIVE: Final = {"fpsprobesize": "0"}
-#: How long to wait for a late packet before using later ones: the time of a few frames on a radio link.
+#: Maximum time to wait for a late packet before using later packets: a few frame periods on a radio link.
 _REORDER: Final = {"max_delay": "50000", "reorder_queue_size": "100"}
 _RTSP: Final = {**_LIVE, "allowed_media_types": "video"}
 _WAYS: Final[Mapping[str, Mapping[str, str]]] = {
@@ -53,30 +53,30 @@ _LISTENING: Final = frozenset({"udp", "rtp"})
 
 @dataclass(frozen=True, slots=True)
 class CameraSource:
-    """A video source for FFmpeg, with its options."""
+    """A video source for FFmpeg, and its options."""
 
-    name: str = field(repr=False)  #: address or path, including its secrets
+    name: str = field(repr=False)  #: address or path, including any secrets
     scheme: str  #: scheme of the address; empty for a device
     options: Mapping[str, str] = field(default_factory=dict)  #: FFmpeg's options
     sdp: str = ""  #: session description (RFC 4566), if no server provides it
-    fallback: Mapping[str, str] | None = None  #: options to retry with if the server refuses the first protocol
-    loses: bool = False  #: whether parts of frames may get lost without being noticed
+    fallback: Mapping[str, str] | None = None  #: options for a retry if the server refuses the first protocol
+    loses: bool = False  #: whether parts of frames can be lost unnoticed
 
     @property
     def host(self) -> str | None:
-        """The host to look up; None if there is none or packets may come from any host."""
+        """The host to look up; None if there is no host, or if packets may come from any host."""
         return None if self.scheme in ("", *_LISTENING) else urlsplit(self.name).hostname
 
     @property
     def shown(self) -> str:
-        """The address without possible secrets: user, password and query."""
+        """The address without parts that may be secret: user, password and query."""
         return without_secrets(self.name)
 
 
 def source_of(text: str, where: str) -> CameraSource:
-    """Parse the address of a camera, or a device's path; error messages begin with ``where``.
+    """Parse the address of a camera or the path of a device; error messages begin with ``where``.
 
-    Raises :class:`UsageError` if the text is neither the address of a supported stream nor a device.
+    Raises :class:`UsageError` if the text is neither a supported stream's address nor a device.
     """
     scheme, separator, _ = text.partition("://")
     if not separator and Path(text).is_relative_to("/dev"):
@@ -98,7 +98,7 @@ def source_of(text: str, where: str) -> CameraSource:
 
 
 def _sdp_of(text: str, where: str) -> str:
-    """Return the SDP for RTP sent to a port of this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``."""
+    """Return the SDP for RTP packets sent to this host: ``rtp://[ADDRESS][:PORT][?payload=96&codec=h264]``."""
     parts = urlsplit(text)
     options = dict(parse_qsl(parts.query, keep_blank_values=True))
     address = parts.hostname or "0.0.0.0"
@@ -128,7 +128,7 @@ INTRINSICS_OPTIONS: Final = frozenset({"calibration", "fx", "fy", "cx", "cy", "d
 
 
 def check_intrinsics(uri: VehicleUri) -> None:
-    """Check the intrinsics in an address; see :func:`intrinsics_of`."""
+    """Check the intrinsics given in an address; see :func:`intrinsics_of`."""
     if "calibration" in uri.options:
         _calibration(uri)
     else:
@@ -136,10 +136,10 @@ def check_intrinsics(uri: VehicleUri) -> None:
 
 
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
-    """Return the intrinsics in an address for frames of the given size [px].
+    """Return the intrinsics given in an address, for frames of this size [px].
 
-    Returns None unless the address gives the focal length, or a calibration for this aspect ratio. Raises
-    :class:`UsageError` if an option makes no sense, options contradict each other, or the calibration can't be read.
+    Returns None unless the address contains the focal length, or a calibration for this aspect ratio. Raises
+    :class:`UsageError` if an option is invalid, options contradict each other, or the calibration can't be read.
     """
     if "calibration" in uri.options:
         calibration = _calibration(uri)
@@ -178,31 +178,31 @@ def _distortion(uri: VehicleUri) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class LiveCameraSettings:
-    """A camera's settings. Size and rate are announced before the first frame, and are requested from a device."""
+    """Settings of a camera. The size and the rate are announced before the first frame, and requested from a device."""
 
     source: CameraSource
     name: str
     width: int  #: width [px]
     height: int
     fps: float
-    stream: bool = True  #: whether its H.264 is forwarded undecoded
-    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's options other than size and rate
-    purpose: str = "a camera"  #: what PyAV is needed for, for error messages
+    stream: bool = True  #: whether the camera's H.264 is forwarded undecoded
+    device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg options other than the size and the rate
+    purpose: str = "a camera"  #: what PyAV is needed for, used in error messages
 
 
 class LiveCamera:
-    """Publishes the camera's newest frame from :meth:`start` to :meth:`stop`, and keeps reconnecting.
+    """Publishes a camera's newest frame from :meth:`start` to :meth:`stop`, and keeps reconnecting.
 
-    PyAV opens it on start. Its H.264 is forwarded undecoded: at once if nothing can have been lost in transit,
-    otherwise only after a decoder that rejects damage has accepted it.
+    PyAV opens the camera on start. Its H.264 is forwarded undecoded: immediately if nothing can have been lost in
+    transit, otherwise after a decoder that rejects damaged frames has accepted it.
 
     Args:
-        settings: The camera's settings.
-        sink: The proxy's sink.
-        intrinsics: Returns the intrinsics for a width and height.
+        settings: Settings of the camera.
+        sink: Sink of the proxy.
+        intrinsics: Called with a width and a height; returns the intrinsics.
         configure: Called on the reading thread with the path of an opened device; returns the settings that failed.
-        absent: Returns the error text for a missing device.
-        on_event: Called with each event and its text, on either thread; None: events go to the sink.
+        absent: Returns the error message for a missing device.
+        on_event: Called with each event and its text, on the reading or decoding thread; None: the sink gets them.
     """
 
     def __init__(
@@ -239,7 +239,7 @@ class LiveCamera:
         )
 
     def start(self) -> None:
-        """Start receiving. Returns at once."""
+        """Start receiving. Returns immediately."""
         self._video.start()
 
     def stop(self) -> None:
@@ -248,7 +248,7 @@ class LiveCamera:
         self._video.stop()
 
     def telemetry(self) -> dict[str, Value]:
-        """Return the counters of :class:`skyloop.drivers.live_video.VideoCounters`, with the prefix ``camera.``."""
+        """Return :class:`skyloop.drivers.live_video.VideoCounters`; the names begin with ``camera.``."""
         return self._video.counters.telemetry("camera")
 
     # On the reading thread ---------------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ class LiveCamera:
         if not source.scheme:
             return self._open_device(open_stream)
         if source.host:
-            # FFmpeg would report an unknown name as an I/O error.
+            # FFmpeg would report an unknown host name as an I/O error.
             socket.getaddrinfo(source.host, None, type=socket.SOCK_STREAM)
         if source.sdp:
             return open_stream(source.sdp.encode(), format_name="sdp", options=dict(source.options))

@@ -1,6 +1,6 @@
-"""Live video through PyAV, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
+"""Receive live video with PyAV, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
 
-All errors during opening and reading are OSErrors with a readable reason.
+All errors in opening and reading are OSErrors with a readable reason.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-HOPELESS_S: Final = 3.0  #: time without a decodable frame after which this is reported
-STRICT_S: Final = 15.0  #: time without undamaged H.264 after which damage is tolerated
-#: Number of frames that FFmpeg holds back: it detects the end of a frame only when the next one starts, and the packets
-#: of a transport stream add the same delay again.
+HOPELESS_S: Final = 3.0  #: time without a decodable frame before this is reported
+STRICT_S: Final = 15.0  #: time without undamaged H.264 before damage is tolerated
+#: Number of frames that FFmpeg holds back. FFmpeg detects the end of a frame only when the next frame starts, and the
+#: packets of a transport stream add the same delay once more.
 _HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
-_REORDERED_NS: Final = 1_000_000_000  # timestamps step back by less for B-frames, by more if a clock is set back
-_STAMPS: Final = 128  # maximum number of capture times stored: two per frame, more than any decoder holds back
+_REORDERED_NS: Final = 1_000_000_000  # B-frames cause smaller backward steps; a clock set back causes larger ones
+_STAMPS: Final = 128  # maximum number of stored capture times: two per frame, more than any decoder holds back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 
 
@@ -46,14 +46,14 @@ class ProtocolRefusedError(ConnectionError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """The bytes of an encoded frame, with everything needed for decoding and timing."""
+    """The bytes of an encoded frame, and everything needed to decode and time it."""
 
     packet: av.Packet[av.VideoStream]
-    context: VideoCodecContext  # codec context of its connection
-    number: int  # number within the connection, from 0
-    unit: Unit | None = None  # the frame as H.264 in Annex B format; None if it is not H.264 or its headers are unknown
-    reason: str = ""  # why the frame can't be forwarded without decoding; empty if it can
-    reordered: bool = False  # H.264 only: whether frames refer to later ones
+    context: VideoCodecContext  # codec context of the frame's connection
+    number: int  # number of the frame within its connection, from 0
+    unit: Unit | None = None  # frame as H.264 in Annex B format; None if it is not H.264 or its headers are unknown
+    reason: str = ""  # why the frame can't be forwarded without decoding; empty if it can be
+    reordered: bool = False  # whether frames depend on later frames (H.264 only)
 
     @property
     def is_h264(self) -> bool:
@@ -64,18 +64,17 @@ class ContainerStream:
     """One connection to a source that PyAV can open.
 
     Args:
-        name: An address or path for FFmpeg, or a file's content.
-        format_name: FFmpeg's name of the format; None: detect it.
-        open_s: Time limit for connecting, the handshake and determining the size of the images [s]; a device that hangs
-            takes longer.
-        read_s: Time limit for the next frame [s]. FFmpeg can't be interrupted, so :meth:`read` may take this long.
+        name: An address or a path for FFmpeg, or the content of a file.
+        format_name: FFmpeg's name of the format; None: FFmpeg detects it.
+        open_s: Time limit for connecting, the handshake and finding the image size [s]; a hanging device takes longer.
+        read_s: Time limit for the next frame [s]. FFmpeg can't be interrupted, and :meth:`read` may take this long.
 
     Raises:
         ProtocolRefusedError: If the server refuses the requested protocol.
         OSError: If the source can't be opened, or has no supported video.
     """
 
-    broken = 0  # FFmpeg does not report the frames it discards
+    broken = 0  # always 0: FFmpeg does not report the frames it discards
     lost_bytes = 0
 
     def __init__(
@@ -102,7 +101,7 @@ class ContainerStream:
                 timeout=(open_s, read_s),
             )
         except Exception as error:
-            if clock() - begun_ns >= nanoseconds(open_s):  # FFmpeg reports a time-out in a handshake as damaged data
+            if clock() - begun_ns >= nanoseconds(open_s):  # FFmpeg reports a time-out in the handshake as damaged data
                 raise TimeoutError(f"no answer, or no frame, within {open_s:g} s") from error
             raise _os_error(error) from error
         try:
@@ -120,7 +119,7 @@ class ContainerStream:
         self._captured_newest_ns = 0
 
     def read(self) -> list[Coded]:
-        """Return the next encoded frame, in a list of one."""
+        """Return the next encoded frame, as a list of one item."""
         try:
             packet = next(self._packets, None)
         except av.error.ExitError as error:
@@ -133,7 +132,7 @@ class ContainerStream:
         self._arrivals.append(now_ns)
         unit = self._units.of(packet)
         captured_ns = min(self._captured_ns(packet), now_ns)
-        if self._units.in_order:  # timestamps that become known later must not set the time back
+        if self._units.in_order:  # timestamps that arrive later must not set the time back
             captured_ns = self._captured_newest_ns = max(captured_ns, self._captured_newest_ns)
         units = self._units
         piece = Piece(packet, self._context, self._number, unit, units.reason, not units.in_order)
@@ -146,7 +145,7 @@ class ContainerStream:
         self._container.close()
 
     def _chosen(self) -> tuple[VideoCodecContext, Iterator[av.Packet[av.VideoStream]]]:
-        """Return the first video stream, ready to be read and decoded."""
+        """Return the first video stream, ready for reading and decoding."""
         videos = self._container.streams.video
         if not videos:
             raise ConnectionError("the source has no video")
@@ -159,12 +158,12 @@ class ContainerStream:
         return context, self._container.demux(videos[0])
 
     def _captured_ns(self, packet: av.Packet[av.VideoStream]) -> int:
-        """Return a frame's capture time, from its timestamp and the smallest recent delay, or else its arrival time."""
+        """Return a frame's capture time: from its timestamp and the smallest recent delay, or else its arrival time."""
         stamp_ns = _stamp_ns(packet)
         if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
             return self._arrivals[0]
         back_ns = 0 if self._newest_ns is None else self._newest_ns - stamp_ns
-        if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # this is a frame that others refer to
+        if not self._units.in_order and 0 < back_ns < _REORDERED_NS:  # other frames depend on this frame
             return stamp_ns + self._offset_ns
         if self._newest_ns is None or back_ns:
             self._newest_ns = stamp_ns
@@ -173,23 +172,23 @@ class ContainerStream:
 
 
 class Units:
-    """Provides a stream's H.264 in Annex B format, whatever its container.
+    """Converts a stream's H.264 to Annex B format, from any container.
 
-    ``reason`` states why frames can't be forwarded without decoding; it is empty while they can.
+    ``reason`` tells why frames can't be forwarded without decoding; it is empty while they can be.
     """
 
     def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
         self._is_h264 = context.name == H264
         self.reason = "" if self._is_h264 else f"the video is {context.name}, not H.264"
-        self.in_order = self._is_h264  #: whether no frame so far has referred to a later one
+        self.in_order = self._is_h264  #: whether no frame so far has depended on a later frame
         self._filter: av.BitStreamFilterContext | None = None
         parameters = bytes(context.extradata or b"")
-        if self._is_h264 and parameters[:1] == b"\1":  # the stream has sizes instead of start codes, as in MP4
+        if self._is_h264 and parameters[:1] == b"\1":  # the stream uses sizes instead of start codes, as in MP4
             self._filter, parameters = av.BitStreamFilterContext("h264_mp4toannexb", stream), b""
         self._inspector = Inspector(parameters)
 
     def of(self, packet: av.Packet[av.VideoStream]) -> Unit | None:
-        """Return a packet's frame, if it has one. Set ``reason`` at the first frame that can't be forwarded."""
+        """Return a packet's frame, if it contains one. Set ``reason`` when the first frame can't be forwarded."""
         if not self._is_h264:
             return None
         data = self._annex_b(packet)
@@ -214,14 +213,14 @@ class Units:
 class LiveDecoder:
     """Decodes one connection after another.
 
-    In H.264, damaged frames are not shown, and neither are those that refer to them, up to the next key frame. Decoding
-    then restarts with a new decoder, because the old one may continue to show the damage. If these rules leave nothing
-    to show for :data:`STRICT_S` (because the encoder is faulty or sends no key frames), FFmpeg alone decides what is
-    good, up to the next undamaged key frame.
+    In H.264, damaged frames are not shown. Frames that depend on them are not shown either, up to the next key frame.
+    Decoding then restarts with a new decoder, because the old decoder may continue to show the damage. If these rules
+    leave nothing to show for :data:`STRICT_S` (because the encoder is faulty or sends no key frames), FFmpeg alone
+    decides which frames are good, up to the next undamaged key frame.
 
     Args:
-        on_whole: Called on the decoding thread with each undamaged frame after it has been decoded.
-        on_forgiving: Called once, with a text, when it begins to tolerate damage.
+        on_whole: Called on the decoding thread with each undamaged frame once it has been decoded.
+        on_forgiving: Called once, with a message, when the decoder begins to tolerate damage.
     """
 
     def __init__(
@@ -236,15 +235,15 @@ class LiveDecoder:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the stream so far, because the next frame does not continue it."""
+        """Forget the stream so far: the next frame does not continue it."""
         self._before: Piece | None = None
-        self._failing_ns: int | None = None  # when pieces began to be undecodable
-        self._barren_since_ns: int | None = None  # when H.264 data last stopped yielding frames
+        self._failing_ns: int | None = None  # when pieces became undecodable
+        self._barren_since_ns: int | None = None  # when H.264 data last stopped producing frames
         self._strict: VideoCodecContext | None = None  # None while H.264 waits for a key frame
-        self._shown_ns = 0  # capture time of the newest frame, before which no later frame can have been captured
-        self._reorders = False  # whether the decoder holds back frames that refer to later ones
+        self._shown_ns = 0  # capture time of the newest frame; later frames can't have been captured earlier
+        self._reorders = False  # whether the decoder holds back frames that depend on later frames
         self._forgiving: VideoCodecContext | None = None
-        # Capture times of the decoders' inputs, by decoder (whether it was the strict one) and timestamp.
+        # Capture times of the decoders' inputs, by decoder (whether it was the strict decoder) and timestamp.
         self._captured: dict[tuple[bool, int | None], int] = {}
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
@@ -270,15 +269,15 @@ class LiveDecoder:
 
     def _decode_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         if not follows:
-            piece.context.flush_buffers()  # otherwise skipped frames would cause smearing
+            piece.context.flush_buffers()  # without this, skipped frames would cause smearing
         return self._judged(piece.context, piece.packet, coded)
 
     def _decode_h264(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         unit = piece.unit
-        if unit is None:  # there are only parameters, or noise
+        if unit is None:  # it contains only parameters, or noise
             self._note_failure(coded)
             return None
-        surprised = piece.reordered and not self._reorders  # the frame that it refers to would be shown before it
+        surprised = piece.reordered and not self._reorders  # the decoder would show the frame it depends on first
         if not follows or unit.after_gap or surprised:
             self._strict = None
             if self._forgiving is not None:
@@ -303,7 +302,7 @@ class LiveDecoder:
             self._reorders = piece.reordered or bool(piece.context.has_b_frames)
             self._strict = new_decoder(H264, "a camera", low_delay=not self._reorders)
         packet = av.Packet(unit.data)
-        packet.pts = piece.number  # comes back with the decoded frame; not every packet of a stream has a timestamp
+        packet.pts = piece.number  # identifies the decoded frame; not every packet of a stream has a timestamp
         try:
             images = self._strict.decode(packet)
         except (av.error.FFmpegError, ValueError):
@@ -314,14 +313,14 @@ class LiveDecoder:
             return None
         self._on_whole(coded)
         if not images:
-            self.waited += 1  # the decoder holds it back until others have been shown
+            self.waited += 1  # the decoder holds it back until it has shown others
             return None
         return images[-1]
 
     def _judged(
         self, context: VideoCodecContext, packet: av.Packet[av.VideoStream], coded: Coded
     ) -> av.VideoFrame | None:
-        """Decode a piece; return the image, or None if it yields none that FFmpeg considers undamaged."""
+        """Decode a piece; return the image, or None if the piece contains none that FFmpeg considers undamaged."""
         try:
             images = context.decode(packet)
         except (av.error.FFmpegError, ValueError):
@@ -366,7 +365,7 @@ def _stamp_ns(timed: av.Packet[av.VideoStream] | av.VideoFrame) -> int | None:
 
 
 def _os_error(error: Exception) -> OSError:
-    """Return an error with a readable message from which the address is omitted, because it may contain a password."""
+    """Return an error with a readable message that omits the address, because the address may contain a password."""
     if isinstance(error, OSError) and error.errno == errno.EPROTONOSUPPORT:
         return ProtocolRefusedError(error.strerror)
     if isinstance(error, av.error.InvalidDataError):

@@ -1,7 +1,7 @@
-"""Receive a vehicle's live video, decode it, and show the newest frame; forward H.264 without decoding.
+"""Receive a vehicle's live video, decode it, and show the newest frame. Forward H.264 without decoding it.
 
-One thread reads frames from the socket as they arrive, so that they don't grow old in a kernel buffer, and keeps
-reconnecting. Another thread decodes the frames that are wanted. Between these two threads, the :class:`FrameBacklog`
+One thread reads frames from the socket as they arrive, to keep them from ageing in a kernel buffer, and keeps
+reconnecting. Another thread decodes the frames that consumers want. Between the two threads, the :class:`FrameBacklog`
 decides which frames to drop when decoding falls behind.
 """
 
@@ -25,38 +25,38 @@ from skyloop.messages import EventKind, Intrinsics, Severity, Value
 from skyloop.messages.frame import Chain
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
-REFUSALS: Final = 3  #: consecutive frames of an unsupported codec before it is reported; a flipped bit may cause one
+REFUSALS: Final = 3  #: number of consecutive unsupported frames before this is reported; a flipped bit may cause one
 _CLOSE_S: Final = 2.0
 LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
-KEYLESS: Final = 600  #: number of frames without a key frame after which a stream is reported as not forwardable
-MAX_FRAMES: Final = 120  #: 4 s of video; the vehicles' key frames are half a second or a second apart
+KEYLESS: Final = 600  #: number of frames without a key frame before the stream is reported as not forwardable
+MAX_FRAMES: Final = 120  #: 4 s of video; vehicles send key frames every half second or second
 
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """An encoded frame on arrival."""
+    """An encoded frame on its arrival."""
 
     data: object  #: input for the vehicle's decoder
-    is_key: bool  #: whether decoding can start here
+    is_key: bool  #: whether decoding can start at this frame
     captured_ns: int  #: capture time, on this host's clock
     arrived_ns: int
-    connection: int  #: increases with each connection; frames never refer to those of another connection
+    connection: int  #: increases with each connection; frames never depend on frames of other connections
 
 
 class FrameBacklog:
-    """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest wins.
+    """Keeps at most :data:`MAX_FRAMES` frames in order of arrival. The newest frames win.
 
     While frames are wanted and decoding keeps up, every frame is decoded and shown. If decoding falls behind, frames
-    before the newest key frame are dropped; the rest must all be decoded, because each refers to the previous one, but
-    only the newest is shown. While no frames are wanted, those since the newest key frame are kept, so that the first
-    subscriber gets an image at once.
+    before the newest key frame are dropped. The remaining frames must all be decoded, because each depends on the
+    previous one, but only the newest frame is shown. While no frames are wanted, the frames since the newest key frame
+    are kept. The first subscriber therefore gets an image immediately.
 
-    ``skipped`` is the number of frames that were wanted but not shown, because newer ones had arrived.
+    ``skipped`` counts frames that were wanted but not shown because newer frames had arrived.
     """
 
     def __init__(self) -> None:
         self.skipped = 0
-        self._frames: deque[tuple[Coded, bool]] = deque()  # each frame, and whether it was wanted on arrival
+        self._frames: deque[tuple[Coded, bool]] = deque()  # frames, and whether each was wanted on arrival
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -66,11 +66,11 @@ class FrameBacklog:
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
-            self._drop(1)  # frames that refer to this one are lost up to the next key frame, as after any loss
+            self._drop(1)  # as after any loss, frames that depend on this one are lost up to the next key frame
         self._frames.append((frame, wanted))
 
     def take(self, now_ns: int) -> tuple[Coded, bool]:
-        """Remove the frame to decode next; return it and whether to show it. Raises ``IndexError`` if there is none."""
+        """Remove the next frame to decode; return it and whether to show it. Raises ``IndexError`` if there is none."""
         if self._late(now_ns):
             keys = [n for n, (frame, _) in enumerate(self._frames) if frame.is_key]
             self._drop(keys[-1] if keys else 0)
@@ -93,7 +93,7 @@ class Decoded(NamedTuple):
 
     number: int  #: the number that the vehicle gave this frame
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    captured_ns: int | None = None  #: capture time; None: the same as that of the last frame passed to the decoder
+    captured_ns: int | None = None  #: capture time; None: that of the last frame passed to the decoder
 
 
 class Stream(Protocol):
@@ -101,14 +101,14 @@ class Stream(Protocol):
 
     @property
     def broken(self) -> int:
-        """Number of frames that were incomplete or stale."""
+        """Number of frames that were incomplete or outdated."""
 
     @property
     def lost_bytes(self) -> int:
-        """Number of bytes that did not belong to a complete frame."""
+        """Number of bytes that did not belong to any complete frame."""
 
     def read(self) -> list[Coded]:
-        """Return the received frames. Raises ``OSError`` if the connection is lost.
+        """Return the frames received. Raises ``OSError`` if the connection is lost.
 
         Should return within a tenth of a second, because :meth:`LiveVideo.stop` waits for it.
         """
@@ -121,19 +121,19 @@ class Decoder(Protocol):
 
     @property
     def waited(self) -> int:
-        """Number of frames skipped because a frame they refer to was missing or a newer one had been shown."""
+        """Number of frames skipped because a frame they depend on was missing, or a newer frame had been shown."""
 
     @property
     def damaged(self) -> int:
         """Number of frames that could not be decoded."""
 
     def restart(self) -> None:
-        """Forget the stream so far, because the next frame does not continue it."""
+        """Forget the stream so far: the next frame does not continue it."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """Decode a frame; return it, or None if there is no image in it or the image is not wanted (``show``).
+        """Decode a frame and return it; return None if it contains no image or if ``show`` is False.
 
-        Raises :class:`UnsupportedError` for an unsupported codec, but nothing else, whatever the frame contains.
+        Raises :class:`UnsupportedError` for an unsupported codec, and no other error, whatever the frame contains.
         """
 
 
@@ -148,20 +148,20 @@ class Picture:
     number: int  #: number that the vehicle gave the frame, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Publish this as a frame of a camera."""
+        """Publish this image as a frame of a camera."""
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
 class VideoEvent(Enum):
-    """Events that a receiver reports."""
+    """Events reported by a receiver."""
 
     STREAMING = "streaming"  #: frames are arriving
-    LOST = "lost"  #: the connection was lost or has not been made yet; reported once per reason, and retried forever
-    UNSUPPORTED = "unsupported"  #: frames use another codec, or the data make no sense; reported once per series
-    FAULT = "fault"  #: an error of this program, reported once; the video continues
+    LOST = "lost"  #: the connection was lost or is not established yet; reported once per reason, retried forever
+    UNSUPPORTED = "unsupported"  #: frames use another codec, or the data is invalid; reported once per series
+    FAULT = "fault"  #: an error in this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
-        """Publish this as an event."""
+        """Publish this event to the sink."""
         kind, severity = _EVENTS[self]
         sink.event(kind, f"{where} {self.value}: {text}", severity, where=where)
 
@@ -176,27 +176,27 @@ _EVENTS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class VideoCounters:
-    """Numbers of frames in all connections, by outcome."""
+    """Numbers of frames in all connections, by what became of them."""
 
     received: int = 0
     frames: int = 0  #: frames shown
-    waited: int = 0  #: frames skipped up to the next key frame, or because a newer one had been shown
-    damaged: int = 0  #: frames cut off, stale at the start of a connection, or undecodable
+    waited: int = 0  #: frames skipped up to the next key frame, or because a newer frame had been shown
+    damaged: int = 0  #: frames that were cut off, outdated at the start of a connection, or undecodable
     refused: int = 0  #: frames of an unsupported kind
-    skipped: int = 0  #: frames that were wanted but superseded by newer ones before decoding
+    skipped: int = 0  #: frames that were wanted but replaced by newer frames before decoding
     lost_bytes: int = 0  #: bytes that did not belong to a complete frame
     reconnects: int = 0  #: connections that delivered frames, not counting the first
 
     def telemetry(self, of: str) -> dict[str, Value]:
-        """Return the counters for feedback's ``native``; ``of`` is the prefix of their names, without the dot."""
+        """Return the counters for ``native`` in feedback; ``of`` is the prefix of their names, without the dot."""
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
 
 class LiveVideo:
-    """The video of one vehicle.
+    """Receives the video of one vehicle.
 
-    While no frames are wanted, nothing is decoded, but the stream is read and the frames since its newest key frame are
-    kept, so that a new subscriber gets an image at once. Nothing is sent or received before :meth:`start`.
+    While no frames are wanted, nothing is decoded. The stream is still read, and the frames since its newest key frame
+    are kept to give a new subscriber an image immediately. Nothing is sent or received before :meth:`start`.
 
     Args:
         place: Human-readable description of where the video comes from.
@@ -204,13 +204,13 @@ class LiveVideo:
         make_decoder: Creates the decoder; raises MissingExtraError if no decoder is installed. Called on the thread
             that calls :meth:`start`.
         show: Called with each frame on the decoding thread; must return quickly.
-        on_event: Called with each event and its text on either thread; must return quickly.
+        on_event: Called with each event and its text, on either thread; must return quickly.
         wants: Returns whether decoded frames are wanted. Called on the reading thread.
-        wants_checked: Returns whether to decode frames even if none are wanted, because undamaged ones are forwarded.
+        wants_checked: Returns whether to decode frames even if none are wanted, because undamaged frames are forwarded.
             Called on the reading thread.
-        came: Called on the reading thread with every complete frame as it arrives.
+        came: Called on the reading thread with every complete frame on its arrival.
         clock: A monotonic clock [ns].
-        name: Name of the reading thread, and prefix of the decoding thread's name.
+        name: Name of the reading thread; the decoding thread's name begins with it.
     """
 
     def __init__(
@@ -239,10 +239,10 @@ class LiveVideo:
         self._clock = clock
         self._name = name
         self._stop = threading.Event()
-        self._changed = threading.Condition()  # guards the backlog and the counts of the reading thread
+        self._changed = threading.Condition()  # guards the backlog and the reading thread's counts
         self._backlog = FrameBacklog()
-        self._wanted = False  # whether frames were wanted when the last frame arrived
-        self._shows = False  # whether frames are wanted, rather than only decoded as a check
+        self._wanted = False  # whether frames were wanted on the last frame's arrival
+        self._shows = False  # whether frames are wanted for display, and not only decoded as a check
         self._received = self._connections = self._broken = self._lost_bytes = 0
         self._stream: Stream | None = None
         self._shown = self._refused = 0
@@ -250,7 +250,7 @@ class LiveVideo:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Start both threads. Returns at once."""
+        """Start both threads. Returns immediately."""
         if self._threads:
             raise UsageError("this receiver has already been started")
         self._decoder = self._make_decoder()
@@ -262,9 +262,9 @@ class LiveVideo:
             thread.start()
 
     def stop(self) -> None:
-        """Stop both threads. Idempotent; no callback runs afterwards, unless this is called from one.
+        """Stop both threads. Idempotent. No callback runs afterwards, unless a callback calls this method.
 
-        Takes up to 4 s; a connection that takes longer to open or read is left to end by itself.
+        Takes up to 4 s; a connection that takes longer to open or read is left to end on its own.
         """
         self._stop.set()
         with self._changed:
@@ -275,7 +275,7 @@ class LiveVideo:
 
     @property
     def counters(self) -> VideoCounters:
-        """The current counts. Thread-safe."""
+        """The current counters. Thread-safe."""
         with self._changed:
             stream, decoder = self._stream, self._decoder
             return VideoCounters(
@@ -313,7 +313,7 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """Serve one connection from beginning to end."""
+        """Serve one connection from its beginning to its end."""
         stream = self._connect(self._connections)
         with self._changed:
             self._stream = stream
@@ -378,7 +378,7 @@ class LiveVideo:
                     self._emit(VideoEvent.FAULT, reported)
 
     def _next(self) -> tuple[Coded, bool] | None:
-        """Wait for a frame to decode. Return the frame and whether to show it; None after :meth:`stop`."""
+        """Wait for a frame to decode. Return the frame, and whether to show it; None after :meth:`stop`."""
         with self._changed:
             self._changed.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             if self._stop.is_set():
@@ -392,9 +392,9 @@ class LiveVideo:
 
 
 class StreamRelay:
-    """Forwards H.264 while it is wanted, starting with a key frame and restarting with one after a gap.
+    """Forwards H.264 while it is wanted. Starts with a key frame, and starts again with one after a gap.
 
-    Works the same whether or not frames are also decoded. Not thread-safe.
+    Works the same way whether or not frames are also decoded. Not thread-safe.
     """
 
     def __init__(self, sink: Sink, intrinsics: Callable[[str, int, int], Intrinsics | None]) -> None:
@@ -404,23 +404,24 @@ class StreamRelay:
         self._source: tuple[str, int] | None = None  # camera and connection of the previous frame
 
     def wanted(self, camera: str) -> bool:
-        """Return whether a camera's stream is wanted. If not, it will restart with a key frame."""
+        """Return whether anyone wants a camera's stream. If not, it later restarts with a key frame."""
         wanted = self._sink.wants_stream(camera)
         if not wanted:
             self.restart()
         return wanted
 
     def restart(self) -> None:
-        """Restart with the next key frame."""
+        """Restart the stream with the next key frame."""
         self._source = None
 
     def take(
         self, camera: str, unit: Unit, captured_ns: int, *, number: int, connection: int, picture: bool = True
     ) -> bool:
-        """Forward an undamaged frame if it is wanted and can be decoded after the last one; return whether it was.
+        """Forward an undamaged frame if it is wanted and decodable after the last one; return whether it was forwarded.
 
-        ``captured_ns`` is the same as in the decoded frame. ``number`` counts the frames received on the connection, so
-        skipped ones show as gaps. ``picture``: False if the unit contains only parameters, which are not forwarded.
+        ``captured_ns`` is the capture time of the decoded frame, too. ``number`` counts the frames received on the
+        connection; skipped frames appear as gaps. ``picture``: False if the unit has only parameters, which are not
+        forwarded.
         """
         if not self.wanted(camera):
             return False
@@ -443,7 +444,7 @@ class StreamRelay:
 
 
 class CheckedRelay:
-    """Forwards the H.264 of a camera whose stream is not known in advance; reports once why if it can't.
+    """Forwards the H.264 of a camera whose stream is not known in advance. If it can't, it reports the reason once.
 
     Not thread-safe.
     """
@@ -453,20 +454,20 @@ class CheckedRelay:
         self._sink = sink
         self._camera = camera
         self._where = where
-        self._refused = (-1, "")  # number of the refused connection, and the reason
+        self._refused = (-1, "")  # number of the refused connection, and why it was refused
         self._waited = 0
         self._reported = ""
 
     @property
     def wanted(self) -> bool:
-        """Whether anyone currently wants the stream."""
+        """Whether anyone wants the stream at present."""
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:
         """Forward an undamaged encoded frame; see :meth:`StreamRelay.take`.
 
-        ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded, for the rest of the
-        connection; empty if it can.
+        ``unit`` is None if its headers are unknown. ``reason``: why it can't be forwarded for the rest of the
+        connection; empty if it can be.
         """
         if not self.wanted:
             return

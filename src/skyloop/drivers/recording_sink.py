@@ -1,4 +1,4 @@
-"""For tests: a sink that keeps a driver's reports, and checks for samples and parameter values."""
+"""Test drivers with a sink that stores their reports, and with checks of samples and parameter values."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from skyloop.messages.fields import CHANNELS
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A frame, with the arguments of :meth:`skyloop.drivers.base.Sink.frame`."""
+    """The arguments of one call of :meth:`skyloop.drivers.base.Sink.frame`."""
 
     camera: str
-    #: A copy of shape (height, width, 3), (height, width) or, for JPEG, (bytes,); empty if malformed or not kept.
+    #: A copy of shape (height, width, 3), (height, width) or, for JPEG, (bytes,); empty if malformed or not stored.
     pixels: NDArray[np.uint8]
     captured_ns: int
-    arrived_ns: int  #: when the call was made, on this host's monotonic clock
+    arrived_ns: int  #: time of the call, on this host's monotonic clock
     width: int
     height: int
     encoding: Encoding
@@ -46,7 +46,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A frame as encoded by the vehicle, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
+    """The arguments of one call of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
@@ -58,15 +58,15 @@ class SeenPicture:
 
 
 class RecordingSink:
-    """A :class:`skyloop.drivers.base.Sink` that keeps recent samples and frames and all link states.
+    """A :class:`skyloop.drivers.base.Sink` that stores recent samples, recent frames and all link states.
 
     ``problems`` describes violations of the contract of :class:`skyloop.drivers.base.Sink`. Thread-safe.
 
     Args:
-        watch: Names of the cameras whose frames are wanted; None: all.
-        keep: How many feedback samples, frames, encoded frames and events to keep; at most 64 frames with pixels.
-        keep_pixels: Whether to keep a copy of the pixels of each frame.
-        record: Whether encoded frames are wanted, from every camera.
+        watch: Names of the cameras whose frames are wanted; None: all cameras.
+        keep: How many feedback samples, frames, encoded frames and events to store; at most 64 frames keep pixels.
+        keep_pixels: Whether to store a copy of the pixels of each frame.
+        record: Whether encoded frames of all cameras are wanted.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class RecordingSink:
     # Called by the driver ------------------------------------------------------------------------------------------
 
     def feedback(self, feedback: Feedback) -> None:
-        """Keep a sample; record a problem if its time is in the future or goes backwards."""
+        """Store a sample; record a problem if its time lies in the future or goes backwards."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time("feedback", feedback.captured_ns, now_ns)
@@ -110,7 +110,7 @@ class RecordingSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep a frame; record a problem if its time or its pixels violate the contract."""
+        """Store a frame; record a problem if its time or its pixels violate the contract."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"frame of {camera}", captured_ns, now_ns)
@@ -121,11 +121,11 @@ class RecordingSink:
             self._notify()
 
     def wants(self, camera: str) -> bool:
-        """Return whether the camera is in ``watch``, or ``watch`` is None."""
+        """Return whether ``watch`` contains the camera or is None."""
         return self.watch is None or camera in self.watch
 
     def wanted_fps(self, camera: str) -> float:
-        """Return infinity for a watched camera, 0 for any other."""
+        """Return infinity for a camera whose frames are wanted, and 0 for any other camera."""
         return math.inf if self.wants(camera) else 0.0
 
     def stream(
@@ -139,7 +139,7 @@ class RecordingSink:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Keep an encoded frame; record a problem if it isn't in Annex B format, or the first isn't a key frame."""
+        """Store an encoded frame; record a problem if it isn't in Annex B format, or if the first isn't a key frame."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"encoded frame of {camera}", captured_ns, now_ns)
@@ -155,14 +155,14 @@ class RecordingSink:
         return self.record
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Record a link state with its reason."""
+        """Record a state of the link and its reason."""
         with self._changed:
             self.links.append((LinkState(state), reason))
             self.remedy = remedy
             self._notify()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Keep an event."""
+        """Store an event."""
         with self._changed:
             self.events.append(VehicleEvent(EventKind(kind), text, Severity(severity), data))
             self._notify()
@@ -171,7 +171,7 @@ class RecordingSink:
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback; None before any has arrived."""
+        """The newest feedback; None before the first sample arrives."""
         return self.feedbacks[-1] if self.feedbacks else None
 
     @property
@@ -180,9 +180,9 @@ class RecordingSink:
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until a condition holds; return False if this takes longer than ``timeout_s`` [s].
+        """Wait until a condition holds; return False if it does not hold within ``timeout_s`` [s].
 
-        ``condition`` is called after each call by the driver, with the sink's lock held.
+        ``condition`` is called after each call by the driver, while the sink's lock is held.
         """
         end = time.monotonic() + timeout_s
         with self._changed:
@@ -227,7 +227,7 @@ class RecordingSink:
         return pixels.reshape((height, width, 3) if channels == 3 else (height, width)).copy()
 
 
-#: Plausible range of each number in feedback; a number outside it most likely has the wrong unit.
+#: Plausible range of each number in feedback; a number outside its range most likely has the wrong unit.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "battery": (0.0, 1.0),
     "battery_v": (0.0, 60.0),
@@ -243,7 +243,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """Describe those numbers in a sample that are not finite, or so large that they must have the wrong unit."""
+    """Describe the numbers in a sample that are not finite, or so large that they must have the wrong unit."""
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
         value = getattr(feedback, name)
@@ -270,7 +270,7 @@ _TYPES: Final[dict[ParameterType, tuple[type, ...]]] = {
 
 
 def mismatch(parameter: Parameter, value: Value) -> str:
-    """Return why a value does not fit a parameter's type, choices or range, worded as a predicate; empty if it fits."""
+    """Return why a value does not fit a parameter's type, choices or range, worded as a predicate; empty if it does."""
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
         return f"is not of type {parameter.type}"
@@ -290,7 +290,7 @@ def mismatch(parameter: Parameter, value: Value) -> str:
 
 
 def another_value(parameter: Parameter) -> Value:
-    """Return a legal value other than the present one, or the present one if there is none."""
+    """Return an allowed value other than the current one; the current value if there is no other."""
     value = parameter.value
     if parameter.choices:
         return next((choice for choice in parameter.choices if choice != value), value)
@@ -307,7 +307,7 @@ def another_value(parameter: Parameter) -> Value:
 def _another_number(value: float, parameter: Parameter) -> float:
     low, high = parameter.minimum, parameter.maximum
     if low is not None and high is not None:
-        if parameter.type is ParameterType.INT:  # the next one: a vehicle may accept only part of a wide range
+        if parameter.type is ParameterType.INT:  # use the next integer: a vehicle may accept only part of a wide range
             return value + 1 if value < high else value - 1
         return (value + low + high) / 3
     if high is not None:
@@ -316,7 +316,7 @@ def _another_number(value: float, parameter: Parameter) -> float:
 
 
 def same(one: Value, other: Value) -> bool:
-    """Return whether two values are equal; numbers may differ by a relative 1e-5 or an absolute 1e-6."""
+    """Return whether two values are equal; numbers may differ by 1e-5 (relative) or 1e-6 (absolute)."""
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, (int, float)) and isinstance(other, (int, float)):

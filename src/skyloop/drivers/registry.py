@@ -1,4 +1,4 @@
-"""Find drivers in the entry-point group ``skyloop.drivers``, where an entry point's name is a URI scheme.
+"""Find drivers in the entry-point group ``skyloop.drivers``, in which the name of each entry point is a URI scheme.
 
 A driver's module is imported only when a vehicle with its scheme is requested.
 """
@@ -15,12 +15,12 @@ from skyloop.drivers.uri import VehicleUri, parse_uri
 from skyloop.errors import DriverError, SkyloopError, UnknownNameError
 
 GROUP: Final = "skyloop.drivers"
-#: Cache by scheme and package folders: entry points take 20 ms to read, and a host may have thousands of drones.
+#: Cache by scheme and package folders: reading entry points takes 20 ms, and a host may have thousands of drones.
 _loaded: Final[dict[tuple[str, tuple[str, ...]], type[Driver]]] = {}
 
 
 def known_schemes() -> list[str]:
-    """Return the schemes claimed by installed packages, sorted, without importing any driver."""
+    """Return the sorted schemes that installed packages claim, without importing any driver."""
     return sorted(_claims())
 
 
@@ -49,8 +49,7 @@ def driver_class(scheme: str) -> type[Driver]:
 def make_driver(uri: str | VehicleUri) -> Driver:
     """Return an unopened driver for a vehicle's address.
 
-    Raises the errors of :func:`driver_class`, and :class:`UsageError` if the address or one of its options makes no
-    sense.
+    Raises the errors of :func:`driver_class`, and :class:`UsageError` if the address or one of its options is invalid.
     """
     parsed = parse_uri(uri) if isinstance(uri, str) else uri
     return driver_class(parsed.scheme)(parsed)
@@ -59,7 +58,7 @@ def make_driver(uri: str | VehicleUri) -> Driver:
 def _claims() -> dict[str, list[EntryPoint]]:
     claims: dict[str, dict[tuple[str, str], EntryPoint]] = defaultdict(dict)
     for entry in entry_points(group=GROUP):
-        # A package found in two folders of sys.path counts as one claim.
+        # A package found in two folders of sys.path counts as a single claim.
         claims[entry.name][entry.value, _package(entry)] = entry
     return {scheme: list(found.values()) for scheme, found in claims.items()}
 
@@ -67,7 +66,7 @@ def _claims() -> dict[str, list[EntryPoint]]:
 def _load(entry: EntryPoint) -> type[Driver]:
     try:
         loaded = entry.load()
-    except SkyloopError:  # its message names the missing package and how to install it
+    except SkyloopError:  # its message names the missing package and explains how to install it
         raise
     except Exception as error:
         raise DriverError(f"the driver for {entry.name}:// from {_owner(entry)} cannot be loaded: {error!r}") from error

@@ -1,4 +1,4 @@
-"""The contract of :mod:`skyloop.drivers.base` as tests: subclass them, name the vehicle, and run pytest.
+"""Test the contract of :mod:`skyloop.drivers.base`: subclass these tests, name the vehicle, and run pytest.
 
 ::
 
@@ -7,9 +7,9 @@
     class TestMyDriver(DriverSuite):
         uri = "mydrone://127.0.0.1?port=5556"
 
-The vehicle at that address must answer and, if it can fly, be on the ground with room around it: the suite takes
+The vehicle at that address must answer and, if it can fly, be on the ground with free space around it: the suite takes
 off, moves about a metre along each axis, turns, and lands. **Never run it with a real vehicle unless it is tied down or
-in a net.** A vehicle that can't fly is not commanded.
+in a net.** A vehicle that can't fly receives no commands.
 
 Tests of features that the vehicle lacks are skipped. The module does not import pytest.
 """
@@ -61,22 +61,22 @@ __all__ = ["DriverSuite", "RecordingSink"]
 
 APPLY_S: Final = 0.05
 NEAR_RAD: Final = 0.3  #: tolerance for the commanded heading [rad]
-#: Function that returns the signed distance the vehicle moved between two samples; None if it is not reported.
+#: Returns the signed distance that the vehicle moved between two samples; None if the vehicle does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
 _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
 
 class DriverSuite:
-    """Base class for a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
+    """Base class for the tests of a driver. Set :attr:`uri` or override :meth:`make`; everything else has a default.
 
-    For a vehicle that is slower or moves less, override the class attributes below; override :meth:`vehicle_disappears`
-    and :meth:`vehicle_appears` to test the loss of the link. To give each test its own fake vehicle, start it in a
-    fixture and override :meth:`new_driver`.
+    For a vehicle that is slower or moves less, override the class attributes below. To test the loss of the link,
+    override :meth:`vehicle_disappears` and :meth:`vehicle_appears`. To give each test a fake vehicle of its own, start
+    it in a fixture and override :meth:`new_driver`.
     """
 
-    uri: ClassVar[str] = ""  #: address of the vehicle to test with
+    uri: ClassVar[str] = ""  #: address of the vehicle to use
 
-    connect_timeout_s: ClassVar[float] = 5.0  #: time limit for the link to come up [s]; the next ones are limits, too
+    connect_timeout_s: ClassVar[float] = 5.0  #: time limit for the link to come up [s]; the next values are limits, too
     feedback_timeout_s: ClassVar[float] = 2.0
     frame_timeout_s: ClassVar[float] = 5.0
     takeoff_timeout_s: ClassVar[float] = 15.0
@@ -84,15 +84,15 @@ class DriverSuite:
     motion_timeout_s: ClassVar[float] = 6.0
     emergency_timeout_s: ClassVar[float] = 3.0
     lost_timeout_s: ClassVar[float] = 5.0
-    close_grace_s: ClassVar[float] = 2.0  #: time for joined threads to vanish from the system's tables [s]
+    close_grace_s: ClassVar[float] = 2.0  #: time for joined threads to disappear from the system's tables [s]
 
     speed: ClassVar[float] = 0.4  #: commanded speed forward, backward, left and right [m/s]
     climb: ClassVar[float] = 0.4  #: commanded speed up and down [m/s]
-    tilt: ClassVar[float] = 0.08  #: commanded roll and pitch, for a vehicle that does not support velocities [rad]
+    tilt: ClassVar[float] = 0.08  #: commanded roll and pitch for a vehicle that doesn't support velocities [rad]
     yaw_rate: ClassVar[float] = 0.6  #: commanded yaw rate [rad/s]
-    distance: ClassVar[float] = 0.15  #: how far the vehicle must move in each direction within ``motion_timeout_s`` [m]
-    turn: ClassVar[float] = 0.2  #: how far the vehicle must turn [rad]
-    near: ClassVar[float] = 0.15  #: how close the vehicle must get to a commanded position [m]
+    distance: ClassVar[float] = 0.15  #: minimum movement in each direction within ``motion_timeout_s`` [m]
+    turn: ClassVar[float] = 0.2  #: minimum turn of the vehicle [rad]
+    near: ClassVar[float] = 0.15  #: maximum distance from a commanded position on arrival [m]
     stand_s: ClassVar[float] = 2.0  #: how long the suite watches a vehicle that must not start its motors [s]
     feedback_age_s: ClassVar[float] = 0.5  #: maximum age of a sample on arrival [s]
     frame_age_s: ClassVar[float] = 1.0  #: maximum age of a frame on arrival [s]
@@ -101,15 +101,15 @@ class DriverSuite:
     # To be implemented or overridden by a driver's test ------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
-        """Return a new, unopened driver. By default, its class is found by the entry point for the URI's scheme.
+        """Return a new, unopened driver. By default, the entry point of the URI's scheme gives the class.
 
         Args:
-            uri: The address of the vehicle to test with; it may include an option that must be refused.
+            uri: Address of the vehicle to use; it may include an option that must be refused.
         """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Make the vehicle that the open driver uses disappear: switch off its radio, or stop its emulator.
+        """Make the vehicle of the open driver disappear: switch off its radio, or stop its emulator.
 
         Raises:
             unittest.SkipTest: Unless overridden.
@@ -132,18 +132,18 @@ class DriverSuite:
 
     @contextmanager
     def opened(self, *, watch: set[str] | None = None, record: bool = False) -> Iterator[tuple[Driver, RecordingSink]]:
-        """Open a driver with a checking sink, wait until its link is up, and close it at the end.
+        """Open a driver with a checking sink, wait until its link is up, and close the driver at the end.
 
         Args:
-            watch: Names of the cameras whose frames are wanted; None: all.
+            watch: Names of the cameras whose frames are wanted; None: all cameras.
             record: Whether encoded frames are wanted.
 
         Yields:
             The open driver and its sink.
 
         Raises:
-            AssertionError: If the link was not UP within :attr:`connect_timeout_s`, or the driver
-                broke the contract of :class:`skyloop.drivers.base.Sink`.
+            AssertionError: If the link was not UP within :attr:`connect_timeout_s`, or if the driver broke the contract
+                of :class:`skyloop.drivers.base.Sink`.
         """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
         driver.open(sink)
@@ -158,8 +158,8 @@ class DriverSuite:
     # Before opening ------------------------------------------------------------------------------------------------
 
     def test_constructor_does_no_io(self) -> None:
-        """The constructor starts no threads and opens no descriptors, and close() without open() does nothing."""
-        self.new_driver()  # fill the import caches first, because they are not the driver's resources
+        """The constructor starts no threads and opens no descriptors; close() without open() does nothing."""
+        self.new_driver()  # fill the import caches first, because they don't belong to the driver
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
         assert _resources() == before, "a constructor started a thread or opened a descriptor"
@@ -167,7 +167,7 @@ class DriverSuite:
             driver.close()  # close() without open() does nothing
 
     def test_capabilities_before_open(self) -> None:
-        """Capabilities are known before open(), and make sense."""
+        """Capabilities are known before open() and are valid."""
         capabilities = self.new_driver().capabilities()
         assert capabilities.vehicle, "capabilities need the vehicle's family name"
         unknown = capabilities.actions - set(ACTION_NAMES.values())
@@ -198,7 +198,7 @@ class DriverSuite:
     # Life cycle ----------------------------------------------------------------------------------------------------
 
     def test_close_is_idempotent_and_final(self) -> None:
-        """A second close() does nothing, and the sink is not called after the first one."""
+        """A second close() does nothing, and the sink is not called after the first close()."""
         with self.opened() as (driver, sink):
             sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
             driver.close()
@@ -217,7 +217,7 @@ class DriverSuite:
             raise AssertionError("opening an open driver must raise UsageError")
 
     def test_can_be_opened_again(self) -> None:
-        """A closed driver can be opened again with another sink."""
+        """After close(), the driver can be opened again with another sink."""
         driver = self.new_driver()
         for _ in range(2):
             sink = RecordingSink()
@@ -228,7 +228,7 @@ class DriverSuite:
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
-        with self.opened() as (_, sink):  # libraries have now created the resources that they keep for themselves
+        with self.opened() as (_, sink):  # libraries have now created the resources that they keep
             self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
@@ -244,7 +244,7 @@ class DriverSuite:
     # Reports -------------------------------------------------------------------------------------------------------
 
     def test_feedback(self) -> None:
-        """Feedback arrives, is recent, plausible in SI units, and leaves the proxy's fields alone."""
+        """Feedback arrives, is recent, has plausible values in SI units, and leaves the proxy's fields alone."""
         with self.opened() as (_, sink):
             arrived = sink.wait(lambda: sink.feedback_count >= 10, self.feedback_timeout_s + 5.0)
             assert arrived, f"{sink.feedback_count} samples of feedback in {self.feedback_timeout_s + 5.0} s"
@@ -260,7 +260,7 @@ class DriverSuite:
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
-        """Frames arrive, are recent, and match the announced cameras in name and size."""
+        """Frames arrive, are recent, and match the names and sizes of the announced cameras."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
@@ -280,7 +280,7 @@ class DriverSuite:
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
-        """Encoded frames arrive, and match the announced cameras in name and size."""
+        """Encoded frames arrive, and match the names and sizes of the announced cameras."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
@@ -296,7 +296,7 @@ class DriverSuite:
             )
 
     def test_link_lost_and_found(self) -> None:
-        """The link is reported as LOST with a reason when the vehicle disappears, and as UP when it returns."""
+        """When the vehicle disappears, the link is reported as LOST, with a reason; when it returns, as UP."""
         with self.opened() as (_, sink):
             self.wait_for_feedback(sink)
             self.vehicle_disappears()
@@ -314,7 +314,7 @@ class DriverSuite:
     def test_apply_returns_what_was_applied_at_once(self) -> None:
         """``apply`` returns a finite action within :data:`APPLY_S`.
 
-        Runs on the ground, using actions that do not take off; flight has its own test.
+        Runs on the ground with actions that do not take off; another test flies.
         """
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
@@ -332,12 +332,12 @@ class DriverSuite:
                     times_s.append(time.perf_counter() - begun)
                     assert type(applied).__name__ in {type(known).__name__ for known in (*harmless, Takeoff())}
                     assert applied.finite, f"apply({action.name}) returned {applied}"
-                # Use the median, because on a busy machine any single call may be delayed.
+                # Use the median: on a busy machine, any single call may be delayed.
                 middle_s = statistics.median(times_s)
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
-        """On the ground, repeating an action has the same effect as a new one if nothing else commands the vehicle."""
+        """On the ground, a repeated action has the same effect as a new one if nobody else commands the vehicle."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
@@ -361,7 +361,7 @@ class DriverSuite:
     # Parameters ----------------------------------------------------------------------------------------------------
 
     def test_parameters_are_well_formed(self) -> None:
-        """Parameters have unique dotted lower-case names, and values and defaults within their own limits."""
+        """Parameters have unique, dotted, lower-case names, and their values and defaults are within their limits."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             parameters = driver.parameters()
@@ -376,11 +376,11 @@ class DriverSuite:
                     assert not problem, f"{parameter.name}: its {what} {value!r} {problem}"
 
     def test_parameters_round_trip(self) -> None:
-        """A written value is in force and listed; the old value is restored afterwards."""
+        """A written value takes effect and is listed; the old value is restored afterwards."""
         with self.opened() as (driver, sink):
             self.wait_for_feedback(sink)
             end = time.monotonic() + self.feedback_timeout_s
-            while not (writable := self._writable(driver)):  # a driver may have to request the parameters first
+            while not (writable := self._writable(driver)):  # a driver may first have to request the parameters
                 if time.monotonic() > end:
                     raise unittest.SkipTest(f"parameters() lists no writable one within {self.feedback_timeout_s} s")
                 time.sleep(0.05)
@@ -413,9 +413,9 @@ class DriverSuite:
     # Flight --------------------------------------------------------------------------------------------------------
 
     def test_flight(self) -> None:
-        """The vehicle takes off, moves in both directions along each axis with the right sign, and lands.
+        """The vehicle takes off, moves in both directions along each axis with the correct signs, and lands.
 
-        If it supports positions, it also flies to some positions.
+        If the vehicle supports positions, it also flies to several positions.
         """
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
@@ -433,7 +433,7 @@ class DriverSuite:
                 flight.land()
 
     def test_a_landing_withdraws_a_takeoff(self) -> None:
-        """After a take-off and an immediate landing, the vehicle is on the ground and stays there."""
+        """After a take-off followed immediately by a landing, the vehicle is on the ground and stays there."""
         with self.opened(watch=set()) as (driver, sink):
             if not {"takeoff", "land"} <= driver.capabilities().actions:
                 raise unittest.SkipTest("the vehicle has no native take-off and landing")
@@ -444,7 +444,7 @@ class DriverSuite:
             self._stands(sink, "a take-off that a landing withdrew")
 
     def test_a_takeoff_is_not_kept_for_a_lost_vehicle(self) -> None:
-        """A take-off requested while the link is lost does not start once the link is back."""
+        """A take-off requested while the link is lost does not start when the link returns."""
         with self.opened(watch=set()) as (driver, sink):
             if "takeoff" not in driver.capabilities().actions:
                 raise unittest.SkipTest("the vehicle has no native take-off")
@@ -453,7 +453,7 @@ class DriverSuite:
             try:
                 lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
                 assert lost, f"the link was not reported LOST; reported: {sink.links}"
-                with suppress(DriverError):  # the best response
+                with suppress(DriverError):  # raising is the best response
                     driver.apply(Takeoff())
             finally:
                 self.vehicle_appears()
@@ -462,7 +462,7 @@ class DriverSuite:
             self._stands(sink, "a take-off from before the link was back", at_once=True)
 
     def _stands(self, sink: RecordingSink, what: str, *, at_once: bool = False) -> None:
-        """Check that the vehicle stays on the ground for ``stand_s``; unless ``at_once``, let it land first."""
+        """Check that the vehicle stays on the ground for ``stand_s``; unless ``at_once``, first let it land."""
         if not at_once:
             time.sleep(1.0)  # time for telemetry to reflect the last command
             sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, self.land_timeout_s)
@@ -471,7 +471,7 @@ class DriverSuite:
         assert not flies, f"the motors turn after {what}: state {sink.newest and sink.newest.state}"
 
     def test_emergency_stop_and_reset(self) -> None:
-        """On the ground, an emergency stop is reported, and only a reset ends it."""
+        """On the ground, the driver reports an emergency stop, and only a reset ends it."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
@@ -480,7 +480,7 @@ class DriverSuite:
             driver.apply(EmergencyStop())
             flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
             if "hover" in actions:
-                with suppress(DriverError):  # the driver may refuse or ignore it
+                with suppress(DriverError):  # the driver may refuse or ignore this
                     driver.apply(Hover())
                 time.sleep(0.2)
                 flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
@@ -494,14 +494,14 @@ class DriverSuite:
             sink: The open driver's sink.
 
         Raises:
-            AssertionError: If none arrived within :attr:`feedback_timeout_s`.
+            AssertionError: If no feedback arrived within :attr:`feedback_timeout_s`.
         """
         received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"
 
 
 def _resources() -> tuple[int, int]:
-    """Return how many threads and open descriptors this process has (0 descriptors if there is no /proc)."""
+    """Return how many threads and open descriptors this process has (0 descriptors if /proc does not exist)."""
     descriptors = Path("/proc/self/fd") if sys.platform == "linux" else Path("/dev/fd")
     count = len(list(descriptors.iterdir())) if descriptors.exists() else 0
     return threading.active_count(), count
@@ -520,13 +520,13 @@ def _check_rotation(name: str, rotation: tuple[float, ...]) -> None:
 
 
 class Flight:
-    """One flight in the suite, using the vehicle's own take-off and landing if it has them, and set-points otherwise.
+    """One flight of the suite. It uses the vehicle's own take-off and landing if they exist, and set-points otherwise.
 
-    Uses the suite's speeds, distances and time-outs. Raises ``AssertionError`` when one of the latter is exceeded.
+    It uses the speeds, distances and time-outs of the suite. Raises ``AssertionError`` when a time-out passes.
     """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
-        """Prepare a flight with an open driver whose link is up; skip the test if it supports no set-points."""
+        """Prepare a flight with an open driver whose link is up; skip the test if the driver supports no set-points."""
         self.suite = suite
         self.driver = driver
         self.sink = sink
@@ -536,7 +536,7 @@ class Flight:
         suite.wait_for_feedback(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
-        """Wait until the newest feedback meets a condition, and return it; the error says "not ``what`` within"."""
+        """Wait until the newest feedback meets a condition, and return it; the error is "not ``what`` within"."""
         sink = self.sink
 
         def holds() -> bool:
@@ -547,7 +547,7 @@ class Flight:
         return sink.newest
 
     def wake(self) -> None:
-        """Wait until the vehicle has started up, if its link reports that it is starting."""
+        """If the link reports that the vehicle is starting, wait until it has started."""
         links, timeout_s = self.sink.links, self.suite.takeoff_timeout_s
         assert self.sink.wait(lambda: not links[-1][1].startswith(WAKING_UP), timeout_s), links[-1]
 
@@ -559,13 +559,13 @@ class Flight:
             settled = (FlightState.HOVERING, FlightState.FLYING)
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
             return
-        self.driver.check(Takeoff())  # check as the proxy does before it climbs
+        self.driver.check(Takeoff())  # check this before climbing, as the proxy does
         self.set_point(up=self.suite.climb)
         self.until(lambda f: f.altitude_m is None or f.altitude_m > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
         self.set_point()
 
     def land(self) -> None:
-        """Land and wait; a vehicle without a landing command descends until it is landed or below 0.1 m."""
+        """Land and wait; without a landing command, the vehicle descends until it is landed or below 0.1 m."""
         if "land" in self.actions:
             self.driver.apply(Land())
             self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
@@ -579,10 +579,10 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Apply a velocity [m/s, rad/s] in body axes if the vehicle supports it, otherwise an attitude to match.
+        """Apply a velocity [m/s, rad/s] in body axes or, if the vehicle does not support it, a matching attitude.
 
-        Of ``forward`` and ``left``, only the sign counts for an attitude, whose angle is the suite's ``tilt``. The
-        command is sent only once, because the driver must keep it in force.
+        For an attitude, whose angle is the suite's ``tilt``, only the signs of ``forward`` and ``left`` matter. The
+        command is sent only once, because the driver must keep applying it.
         """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
@@ -592,7 +592,7 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Move in both directions along each axis, so that the sign can be checked."""
+        """Move in both directions along each axis to check the signs."""
         suite = self.suite
         for sign in (1.0, -1.0):
             self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
@@ -601,7 +601,7 @@ class Flight:
             self._goes("left", partial(_along, axis=1), sign * suite.distance, left=sign * suite.speed)
 
     def goes_to_places(self) -> None:
-        """Fly to a position to the side and above, turn, and fly back."""
+        """Fly to a position to the side and higher up, turn, and fly back."""
         suite, start = self.suite, self.sink.newest
         assert start is not None
         assert start.position_m is not None, "a vehicle that supports positions must report its own"
@@ -614,16 +614,16 @@ class Flight:
             def is_there(feedback: Feedback, place: Position = place) -> bool:
                 near = feedback.position_m is not None and math.dist(feedback.position_m, place.place) <= suite.near
                 turned = feedback.yaw_rad is None or abs(wrap_angle(turn - feedback.yaw_rad)) <= NEAR_RAD
-                return near and turned  # if no yaw is given, the vehicle keeps its heading
+                return near and turned  # without a given yaw, the vehicle keeps its heading
 
             self.until(is_there, suite.motion_timeout_s, f"at {place}")
 
     def _goes(self, axis: str, measure: Measure, goal: float, **set_point: float) -> None:
-        """Command, wait until the vehicle has passed the goal, then stop."""
+        """Send a command, wait until the vehicle has passed the goal, and stop."""
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not report the quantity measured for this axis
+            return  # the vehicle does not report what is measured for this axis
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -635,7 +635,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Wait until a vehicle that reports its speed is slow again, because it coasts after an attitude."""
+        """Wait until a vehicle that reports its speed has slowed down, because it coasts after an attitude."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -643,7 +643,7 @@ class Flight:
 
 
 def _summary(feedback: Feedback | None) -> str:
-    """Return the fields that a driver filled in, and the age of the feedback, for an error message."""
+    """Return the fields that a driver filled in and the age of the feedback, for an error message."""
     if feedback is None:
         return "none"
     age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9
@@ -665,7 +665,7 @@ def _turned(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """Return the distance along the heading (axis 0) or to its left (1) [m]; the speed, if there is no position."""
+    """Return the distance [m] along the heading (axis 0) or to its left (1); without a position, return the speed."""
     if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
     east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]

@@ -1,4 +1,4 @@
-"""Addresses of vehicles: ``scheme://place?option=value``. Pure."""
+"""Parse the addresses of vehicles: ``scheme://place?option=value``. Pure."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, withou
 from skyloop.errors import UsageError
 
 _HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_SHORT_SECRET: Final = 4  # number of characters below which secrets also occur within ordinary words
+_SHORT_SECRET: Final = 4  # number of characters below which a secret also occurs within ordinary words
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 
 class VehicleUri:
     """A parsed vehicle address that doesn't reveal its secrets.
 
-    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles don't contain users, passwords or keys (see
-    ``skyloop.address``). Only code that opens the vehicle reads them, with :meth:`reveal_place` and :meth:`reveal`.
+    ``str()``, ``repr()``, :attr:`place`, :attr:`options` and pickles contain no users, passwords or keys (see
+    ``skyloop.address``). Only code that opens the vehicle reads these, with :meth:`reveal_place` and :meth:`reveal`.
     """
 
     __slots__ = ("_given", "_secrets", "options", "place", "scheme")
 
     def __init__(self, scheme: str, place: str = "", options: Mapping[str, str] | None = None, text: str = "") -> None:
-        """Store an address: the driver's name, a host, a path or nothing, and options by name.
+        """Store an address: the driver's name; a host, a path or nothing; and options by name.
 
-        ``text`` is the address as given; empty if it is built in code.
+        ``text`` is the original address; empty if code builds the address.
         """
         given = dict(options or {})
         broken = is_broken(given)
-        self.scheme: Final = scheme  #: the driver's name
+        self.scheme: Final = scheme  #: name of the driver
         #: The part between ``://`` and ``?``, percent-decoded: a host, a path, or empty.
         self.place: Final = without_secrets(place, broken=broken, place_of=scheme)
-        #: Names and values as given, percent-decoded.
+        #: Option names and values as given, percent-decoded.
         self.options: Final[Mapping[str, str]] = {
             shown_name(name): without_secrets(value, name, broken=broken) if value else value
             for name, value in given.items()
@@ -78,17 +78,17 @@ class VehicleUri:
         return self._given[0]
 
     def reveal(self, option: str) -> str | None:
-        """Return an option with its secrets, as :meth:`reveal_place` does for the place; None if it was not given."""
+        """Return an option with its secrets; None if it was not given. See :meth:`reveal_place` for its use."""
         return self._given[1].get(option)
 
     def reveal_text(self) -> str:
-        """Return the whole address with its secrets, only for the process that serves it."""
+        """Return the whole address with its secrets, for use only by the process that serves it."""
         return self._given[2] or f"{self.scheme}://{self._given[0]}"
 
     def scrub(self, text: str) -> str:
-        """Return a text, for example a library's error, with the secrets of this address hidden."""
+        """Hide the secrets of this address in a text, such as a library's error message."""
         for given, shown in self._secrets:
-            if len(given) < _SHORT_SECRET:  # hiding it within words would hide too much, and so give it away
+            if len(given) < _SHORT_SECRET:  # hiding it within words would hide too much, and thereby reveal it
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
             else:
                 text = text.replace(given, shown)
@@ -99,7 +99,7 @@ class VehicleUri:
 
         Args:
             option: Name of the option.
-            default: Returned if the option is not given; not checked against the range.
+            default: Value to return if the option is not given; not checked against the range.
             minimum: Smallest allowed value.
             maximum: Largest allowed value.
 
@@ -121,16 +121,16 @@ class VehicleUri:
         return value
 
     def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
-        """Return an option as a whole number within a range; arguments and errors are the same as in :meth:`number`."""
+        """Return an option as a whole number within a range; arguments and errors are those of :meth:`number`."""
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
             raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
         return int(value)
 
     def flag(self, option: str, default: bool = False) -> bool:
-        """Return an option as a bool: ``1``, ``true``, ``yes`` or the bare name; ``0``, ``false`` or ``no``.
+        """Return an option as a bool: ``1``, ``true``, ``yes`` or only the name, or ``0``, ``false`` or ``no``.
 
-        Raises :class:`UsageError` for any other value. ``default`` is returned if the option is not given.
+        Raises :class:`UsageError` for any other value. If the option is not given, ``default`` is returned.
         """
         given = self.options.get(option)
         if given is None:
@@ -160,9 +160,9 @@ def host_and_port(text: str) -> tuple[str, int] | None:
 
 
 def parse_uri(text: str) -> VehicleUri:
-    """Parse a vehicle's address, such as ``ardrone://192.168.1.1?camera=front``, which may be percent-encoded.
+    """Parse a vehicle's address, such as ``ardrone://192.168.1.1?camera=front``; it may be percent-encoded.
 
-    Raises :class:`UsageError` if the text has no scheme with ``://``, or gives an option twice.
+    Raises :class:`UsageError` if the text has no scheme followed by ``://``, or gives an option twice.
     """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):

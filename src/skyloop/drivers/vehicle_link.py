@@ -1,6 +1,6 @@
-"""The vehicle link over sockets: runs its thread, and renews sockets while nothing is received.
+"""Serve the vehicle link over sockets: run its thread, and renew the sockets while nothing is received.
 
-The session decides what the link carries: see :mod:`skyloop.drivers.vehicle_session`.
+The session decides what the link transmits: see :mod:`skyloop.drivers.vehicle_session`.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from skyloop.drivers.base import ServedLink, Sink
 from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
 
-NAME_WAIT_S: Final = 0.2  #: time that suffices for most name look-ups
+NAME_WAIT_S: Final = 0.2  #: time within which most name look-ups finish
 PAUSE_S: Final = 0.03  #: pause after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets that receive nothing: this host may have a new address
+RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets that receive nothing; this host may have a new address
 MAX_DATAGRAM: Final = 65_536
-BURST: Final = 32  #: maximum number of datagrams read before commands get their turn
+BURST: Final = 32  #: maximum number of datagrams to read before commands are sent
 
 S = TypeVar("S", bound=VehicleSession)
 C = TypeVar("C", bound="Readable")
 
 
 class Readable(Protocol):
-    """Anything with a file descriptor that the link can wait for, such as a socket."""
+    """Anything with a file descriptor for which the link can wait, such as a socket."""
 
     def fileno(self) -> int: ...
 
@@ -41,10 +41,10 @@ class Readable(Protocol):
 
 
 class NameLookup:
-    """Looks up host names in its own thread, because without a network a resolver often takes 10 s.
+    """Looks up host names in its own thread: without a network, a resolver often takes 10 s.
 
     It looks up one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
-    that also serves others.
+    that also serves other links.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
@@ -54,11 +54,11 @@ class NameLookup:
 
     @property
     def answered(self) -> bool:
-        """Whether a pending look-up has finished, so that :meth:`address` is worth calling again."""
+        """Whether a pending look-up has finished and :meth:`address` is worth calling again."""
         return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
-        """Return a host's first address. Blocks for up to ``wait_s``."""
+        """Return the first address of a host. Blocks for up to ``wait_s``."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -77,7 +77,7 @@ class NameLookup:
 def _resolve(question: Future[str], host: str, family: socket.AddressFamily) -> None:
     try:
         question.set_result(str(socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)[0][4][0]))
-    except UnicodeError:  # a label that is too long
+    except UnicodeError:  # a label of the name is too long
         question.set_exception(OSError(errno.EINVAL, f"{host!r:.80} is not a valid host name"))
     except Exception as error:  # noqa: BLE001  (raised where the answer is awaited)
         question.set_exception(error)
@@ -86,18 +86,18 @@ def _resolve(question: Future[str], host: str, family: socket.AddressFamily) -> 
 class VehicleLink(ABC, Generic[S]):
     """Serves a session in its own thread from :meth:`start` to :meth:`stop`.
 
-    The session makes all decisions while ``lock`` is held; its callbacks run after the lock is released. A subclass for
+    The session makes all decisions while ``lock`` is held. Its callbacks run after the lock is released. A subclass for
     a kind of vehicle implements :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and passes each
     socket that it opens to :meth:`_watch`.
 
     Args:
         name: Name of the thread.
-        session: The vehicle's protocol.
-        deliver: Called on the link's thread with the callbacks that the session has for the sink.
+        session: Protocol of the vehicle.
+        deliver: Called on the link's thread with the callbacks that the session has queued for the sink.
         clock: A monotonic clock [ns].
-        family: Address family for looking up the host.
+        family: Address family used to look up the host.
         close_s: How long :meth:`stop` waits for the thread to end.
-        serve: Hands the link to a thread that serves several links; None: the link has its own thread.
+        serve: Passes the link to a thread that serves several links; None: the link uses its own thread.
     """
 
     def __init__(
@@ -119,16 +119,16 @@ class VehicleLink(ABC, Generic[S]):
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
         self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
-        self._awake_ns = 0  # time at which its thread wakes at the latest
-        self._opened_ns: int | None = None  # when sockets were last opened, or an attempt to do so was made
+        self._awake_ns = 0  # latest time at which the link's thread wakes
+        self._opened_ns: int | None = None  # when sockets were last opened, or an attempt was made to open them
         self._close_s = close_s
-        self._within: int | None = None  # identity of the thread that is serving it
+        self._within: int | None = None  # identity of the thread that currently serves the link
         self._ended = threading.Event()
         self._serve_elsewhere = serve
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Start the thread, or have a shared one serve the link."""
+        """Start the thread, or let a shared thread serve the link."""
         self._awake.setblocking(False)
         self._waker.setblocking(False)
         self._watch(self._awake, self._drain_wakeups)
@@ -138,7 +138,7 @@ class VehicleLink(ABC, Generic[S]):
             self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread, close the sockets and end the session; callers waiting for an answer get none."""
+        """Stop the thread, close the sockets and end the session; callers that wait for an answer get none."""
         self._stopping.set()
         self._wake()
         if self._within != threading.get_ident():
@@ -147,7 +147,7 @@ class VehicleLink(ABC, Generic[S]):
             self.session.close()
 
     def command(self, action: AnyAction) -> AnyAction:
-        """Pass an action to the session, and send it at once if possible; return the resulting action. Thread-safe."""
+        """Pass an action to the session; if possible, send it immediately. Return the resulting action. Thread-safe."""
         return self._decide(partial(self.session.command, action))
 
     # For methods of subclasses that the proxy's threads call ------------------------------------------------------
@@ -168,7 +168,7 @@ class VehicleLink(ABC, Generic[S]):
     ) -> str | None:
         """Send a request; return the answer, or ``otherwise`` if none arrives in time. Never on the link's thread.
 
-        ``ask`` is called with the lock held, and is given the function to call with the answer.
+        ``ask`` is called with the lock held, and receives the function to call with the answer.
         """
         done = threading.Event()
         answers: list[str | None] = []
@@ -187,23 +187,23 @@ class VehicleLink(ABC, Generic[S]):
 
     @abstractmethod
     def _open_sockets(self) -> None:
-        """Replace the sockets with new ones. Called on the link's thread, without holding the lock.
+        """Replace the sockets with new ones. Called on the link's thread, without the lock.
 
-        Raises ``OSError`` if they can't be opened; the link retries.
+        Raises ``OSError`` if the sockets can't be opened; the link retries.
         """
 
     @abstractmethod
     def _close_sockets(self) -> None:
-        """Close the sockets of :meth:`_open_sockets`. The lock is held."""
+        """Close the sockets that :meth:`_open_sockets` opened. The caller holds the lock."""
 
     @abstractmethod
     def _send_due(self, now_ns: int) -> None:
         """Send everything that is due. Called with the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return how long after opening the sockets they are reopened; None if they aren't at present.
+        """Return how long after opening the sockets they are reopened; None if they should stay open for now.
 
-        The default suits UDP: sockets are reopened while nothing is received. Called with the lock held.
+        The default suits UDP: sockets are reopened while they receive nothing. Called with the lock held.
         """
         return None if self.session.is_receiving else RENEW_NS
 
@@ -211,7 +211,7 @@ class VehicleLink(ABC, Generic[S]):
         """Do work at regular intervals. Called with the lock held, on the link's thread."""
 
     def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
-        """Call a function on the link's thread, without holding the lock, whenever a source is readable."""
+        """Call a function on the link's thread, without the lock, whenever a source is readable."""
         self._selector.register(source, selectors.EVENT_READ, ready)
 
     def _forget(self, source: Readable) -> None:
@@ -223,7 +223,7 @@ class VehicleLink(ABC, Generic[S]):
     def _read_datagrams(
         self, port: socket.socket, handle: Callable[[bytes, int], None], sender: str | None = None
     ) -> None:
-        """Handle at most :data:`BURST` received datagrams; with a ``sender``, only those from that address."""
+        """Handle at most :data:`BURST` received datagrams; with a ``sender``, only datagrams from that address."""
         for _ in range(BURST):
             try:
                 datagram, source = port.recvfrom(MAX_DATAGRAM)
@@ -242,7 +242,7 @@ class VehicleLink(ABC, Generic[S]):
         try:
             port.send(datagram)
         except BlockingIOError:
-            pass  # the datagram is lost, as any datagram may be
+            pass  # the datagram is lost, which any datagram may be
         except OSError as error:
             self.session.failed(error)
 
@@ -262,7 +262,7 @@ class VehicleLink(ABC, Generic[S]):
                 self.session.failed(error)
 
     def _step(self, *, wait: bool = True, look: bool = True) -> None:
-        self._renew()  # renew sockets before waiting, so that none is closed between becoming readable and being read
+        self._renew()  # renew sockets before waiting; none is then closed between becoming readable and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
@@ -290,7 +290,7 @@ class VehicleLink(ABC, Generic[S]):
             self.end()
 
     def end(self) -> None:
-        """Close everything, on the serving thread; nothing is delivered afterwards."""
+        """Close everything, on the serving thread; afterwards nothing is delivered."""
         with self.lock:
             self._close_sockets()
         self._selector.close()
@@ -301,7 +301,7 @@ class VehicleLink(ABC, Generic[S]):
     # On a shared thread -----------------------------------------------------------------------------------------------
 
     def fileno(self) -> int:
-        """Return a descriptor that becomes readable when there is work."""
+        """Return a descriptor that becomes readable when there is work to do."""
         return self._selector.fileno()
 
     def serve(self, *, readable: bool) -> int | None:
@@ -332,33 +332,33 @@ class VehicleLink(ABC, Generic[S]):
 
 
 class ConnectionLink(VehicleLink[S], Generic[S, C]):
-    """A link over one connection, which is reopened when it breaks or delivers nothing.
+    """A link over one connection that is reopened when it breaks or delivers nothing.
 
     A subclass for a kind of vehicle implements :meth:`_connect`, :meth:`_read` and :meth:`_send_due`.
     """
 
-    RETRY_NS: ClassVar[int]  #: pause between connection attempts
+    RETRY_NS: ClassVar[int]  #: pause between attempts to connect
 
-    _silent_ns: int | None = None  # the connection is reopened after this long without data; None: never
+    _silent_ns: int | None = None  # time without data before the connection is reopened; None: it never is
     _connection: C | None = None
     _broken = False  # whether nothing more can be sent
 
     @abstractmethod
     def _connect(self) -> C:
-        """Open a connection. On the link's thread, with the lock free.
+        """Open a connection. Called on the link's thread, without the lock.
 
-        Raises ``OSError`` if it can't be opened; the link retries.
+        Raises ``OSError`` if the connection can't be opened; the link retries.
         """
 
     @abstractmethod
     def _read(self, connection: C) -> None:
-        """Pass received data to the session. On the link's thread, with the lock free.
+        """Pass the received data to the session. On the link's thread, with the lock free.
 
         Raises ``OSError`` if the connection has ended.
         """
 
     def _on_end(self, connection: C) -> None:
-        """Send everything that is due before the connection is closed for good. Called with the lock held."""
+        """Send everything that is due before the connection is finally closed. Called with the lock held."""
 
     def _on_broken(self, error: OSError, now_ns: int) -> None:
         """Handle a connection that no longer accepts data. Called with the lock held."""

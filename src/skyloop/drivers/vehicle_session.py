@@ -1,6 +1,6 @@
-"""The parts common to all vehicle sessions: the link's state and its reasons, pending events, the emergency stop.
+"""Provide what all vehicle sessions share: the link's state and its reasons, pending events, the emergency stop.
 
-Pure except for :func:`serial_trouble`, which inspects the port's device.
+Pure except for :func:`serial_trouble`, which inspects the device of the port.
 """
 
 from __future__ import annotations
@@ -21,32 +21,32 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
-REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reports of a reason while nothing is received
-_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # errors when another program has locked the port
-_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of ports below /dev
-_MAX_LISTED_PORTS: Final = 4  # maximum number of ports listed in a message
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time before a reason is reported again while nothing is received
+_BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # error numbers if another program has locked the port
+_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of port names below /dev
+_MAX_LISTED_PORTS: Final = 4  # maximum number of ports that a message lists
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
 
 def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:
-    """Pass a session's pending callbacks to a sink."""
+    """Pass the pending callbacks of a session to a sink."""
     for publish in pending:
         publish(sink)
 
 
 @dataclass(frozen=True, slots=True)
 class LinkTimeouts:
-    """Time without data [ns] after which a vehicle's link counts as degraded or lost."""
+    """Times without data [ns] after which a vehicle's link counts as degraded or lost."""
 
     degraded_ns: int
     lost_ns: int
-    first_word_ns: int  #: time since opening after which a vehicle that has sent no data is reported as lost
+    first_word_ns: int  #: time after opening before a vehicle that has sent no data is reported as lost
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleEvent:
-    """A session's event for the sink, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
+    """A session's event for the sink; its fields are the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
 
     kind: EventKind
     text: str
@@ -55,40 +55,39 @@ class VehicleEvent:
 
 
 def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> VehicleEvent:
-    """Return an event with a message from the vehicle itself."""
+    """Return an event that contains a message from the vehicle itself."""
     return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
 class Arrival(Enum):
-    """How a packet's number relates to those before it."""
+    """How a packet's number relates to earlier numbers."""
 
     NEW = auto()
-    LATE = auto()  #: packets with higher numbers arrived before it
-    RESTARTED = auto()  #: the vehicle has restarted and counts from the beginning
+    LATE = auto()  #: packets with higher numbers arrived earlier
+    RESTARTED = auto()  #: the vehicle has restarted and counts from the beginning again
 
 
 RESTART_RUN: Final = 5  #: number of packets with low, increasing numbers that prove a restart
-RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time between the first and last, to rule out a single burst
+RESTART_SPAN_NS: Final = nanoseconds(0.02)  #: minimum time from first to last, to rule out a single burst
 
 
 class RestartWatch:
-    """Distinguishes a restart of the vehicle from late packets, by the packets' increasing numbers. Pure.
+    """Distinguishes a restart of the vehicle from late packets by the packets' increasing numbers. Pure.
 
-    Packets whose numbers lag by no more than ``tolerance`` are accepted. Numbers wrap around to 0 at ``wrap``; 0:
-    never.
+    Packets whose numbers lag by at most ``tolerance`` are accepted. Numbers wrap around to 0 at ``wrap``; 0: never.
     """
 
     def __init__(self, tolerance: int = 0, wrap: int = 0) -> None:
         self._tolerance, self._wrap = tolerance, wrap
         self._newest: int | None = None
-        self._behind: tuple[int, int, int] | None = None  # last low number, count, arrival of the first
+        self._behind: tuple[int, int, int] | None = None  # last low number, how many there were, arrival of the first
 
     def forget(self) -> None:
-        """Accept the next packet as new, because nothing was received from the vehicle for a while."""
+        """Accept the next packet as new, because nothing has been received from the vehicle for a while."""
         self._newest = self._behind = None
 
     def update(self, number: int, now_ns: int) -> Arrival:
-        """Classify a packet that has just arrived by its number."""
+        """Classify a packet that has just arrived, by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
@@ -109,85 +108,86 @@ class RestartWatch:
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: How long after its last repeat a request is kept, or sent, while nothing is received. An application that still wants
-#: it keeps repeating it; otherwise it might interfere with another application's flight.
+#: While nothing is received, a request is kept, or sent repeatedly, for this long after its last repeat. An application
+#: that still wants the request keeps repeating it. Otherwise, the request might interfere with another application's
+#: flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
 class VehicleSession(ABC):
     """The protocol between one opened driver and its vehicle. Not thread-safe.
 
-    Time is an argument; bytes go in and out. Calls to the proxy's sink are collected as callbacks, which the caller
-    runs without holding any lock. A subclass for a kind of vehicle sets ``_received_ns`` on each valid packet and calls
-    :meth:`_check_silence` on each poll.
+    The time is an argument, and bytes go in and out. Calls to the proxy's sink are collected as callbacks. The caller
+    runs them without holding any lock. A subclass for a kind of vehicle sets ``_received_ns`` on each valid packet, and
+    calls :meth:`_check_silence` on each poll.
     """
 
     TIMEOUTS: ClassVar[LinkTimeouts]
 
     def __init__(self, now_ns: int) -> None:
-        self.due_ns = now_ns  #: when there will next be something to send
-        self.link_state: LinkState | None = None  #: the last state reported
+        self.due_ns = now_ns  #: time at which there is next something to send
+        self.link_state: LinkState | None = None  #: last state reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._received_ns: int | None = None  # when data last arrived; None: not since opening or losing the link
+        self._received_ns: int | None = None  # when data last arrived; None: not since the link was opened or lost
         self._unreachable = ""
         self._remedy = ""  # what to do if the vehicle is unreachable
         self._reported_reason = ""
         self._reported_ns = now_ns
-        self._landing_ns: int | None = None  # time of the last request to land or, if later, of the last data
+        self._landing_ns: int | None = None  # time of the last landing request or, if later, of the last data
 
     @property
     def is_receiving(self) -> bool:
-        """Whether data are arriving from the vehicle, or were until a moment ago."""
+        """Whether data is arriving from the vehicle, or was arriving until a moment ago."""
         return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action; return what is applied within the limits. Raises DriverError if that is impossible."""
+        """Accept an action; return the action applied within the limits. Raises DriverError on failure."""
 
     @abstractmethod
     def close(self) -> None:
-        """End the session; callers waiting for an answer get a failure."""
+        """End the session; callers that wait for an answer get a failure."""
 
     def unreachable(self, reason: str) -> None:
-        """Record why the vehicle can't be reached: nothing listens, there is no route, or the connection failed."""
+        """Record why the vehicle can't be reached: no program listens, there is no route, or the connection failed."""
         self._unreachable, self._remedy = reason, ""
 
     def failed(self, error: OSError) -> None:
-        """Record an error of a socket or port, with a remedy for the user."""
+        """Record an error of a socket or a port, with a remedy for the user."""
         trouble = self._trouble(error)
         self._unreachable, self._remedy = trouble.reason, trouble.remedy
 
     def connected(self) -> None:  # noqa: B027  most connections need nothing
-        """Handle a new connection; no data from older ones arrive after it."""
+        """Handle a new connection; data from older connections no longer arrives."""
 
     def broken(self, error: OSError, now_ns: int) -> None:
-        """Handle an open connection that accepts no more data: the vehicle is lost even if it still sends."""
+        """Handle an open connection that accepts no more data: the vehicle counts as lost even if it still sends."""
         self.failed(error)
         self.due_ns = now_ns
         if self._received_ns is not None:
             self._lose(f"the connection failed: {self._unreachable}", now_ns)
 
     def drain(self) -> list[SinkCallback]:
-        """Return the callbacks for the sink since the last call, in order."""
+        """Return the callbacks for the sink that were added since the last call, in order."""
         for event in self._new_events():
             self._publish_event(event)
         pending, self._pending = self._pending, []
         return pending
 
     def _new_events(self) -> Iterable[VehicleEvent]:
-        """Return the events since the last call that are specific to this kind of vehicle."""
+        """Return the events specific to this kind of vehicle that were added since the last call."""
         return ()
 
     @abstractmethod
     def _describe_silence(self, since: str, why: str) -> str:
-        """Return the text to show while nothing is received.
+        """Return the text to display while nothing is received.
 
-        ``since`` (the duration) and ``why`` (the host's reason) are phrases that start with a space; both may be empty.
+        ``since`` (the duration) and ``why`` (the host's reason) are phrases that start with a space. Both may be empty.
         """
 
     def _advice(self) -> str:
-        """Return an instruction for the user, to show while nothing is received although nothing has failed."""
+        """Return an instruction to display to the user while nothing is received although nothing has failed."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -195,10 +195,10 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """Discard all state of the lost vehicle, so that its next packet starts from scratch."""
+        """Discard all state of the lost vehicle; its next packet is treated as the first."""
 
     def _keep(self, action: AnyAction, now_ns: int) -> None:
-        """Record an accepted action: a landing is remembered while nothing is received, but not forever."""
+        """Record an accepted action; while nothing is received, a landing is remembered for a limited time."""
         if not isinstance(action, Idle):
             self._landing_ns = now_ns if isinstance(action, Land) else None
 
@@ -238,7 +238,7 @@ class VehicleSession(ABC):
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
     def _silence_seen_ns(self, latest_ns: int) -> int:
-        """Return when :meth:`_check_silence` must be called next; never later than ``latest_ns``."""
+        """Return when :meth:`_check_silence` must be called next, which is never later than ``latest_ns``."""
         if self._received_ns is None:
             return latest_ns
         patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
@@ -265,14 +265,14 @@ class VehicleSession(ABC):
 
 @dataclass(frozen=True, slots=True)
 class LinkTrouble:
-    """The reason why a vehicle can't be reached."""
+    """Why a vehicle can't be reached."""
 
     reason: str  #: what failed; may be empty
     remedy: str = ""  #: an instruction for the user; may be empty
 
 
 def trouble_of(error: OSError, advice: str) -> LinkTrouble:
-    """Describe the error of a socket."""
+    """Describe a socket's error."""
     if isinstance(error, socket.gaierror):
         remedy = "correct the name in the address, or join a network where it is known"
         return LinkTrouble(f"its name is unknown: {error.strerror}", remedy)
@@ -283,7 +283,7 @@ def trouble_of(error: OSError, advice: str) -> LinkTrouble:
 
 
 def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path("/dev")) -> LinkTrouble:
-    """Describe why a serial port can't be opened, or has disappeared; list other ports in the folder ``devices``."""
+    """Describe why a serial port can't be opened or has disappeared, and list the other ports in ``devices``."""
     path = Path(port)
     try:
         status = path.stat()
@@ -316,38 +316,38 @@ def _permission(port: str, status: os.stat_result) -> str:
     return f"join the group {group}: sudo usermod -a -G {group} $USER, then log in again"
 
 
-PACE_NS: Final = nanoseconds(0.1)  #: interval between repeats
+PACE_NS: Final = nanoseconds(0.1)  #: interval between repeats of the stop
 GIVE_UP_NS: Final = nanoseconds(10.0)  #: a stop not confirmed by the vehicle this long after the press is abandoned
-AGAIN_NS: Final = nanoseconds(0.3)  #: after a pause this long, a request counts as a new press rather than a repeat
-SETTLE_NS: Final = nanoseconds(0.5)  #: reports that arrive sooner than this after the press may predate it
+AGAIN_NS: Final = nanoseconds(0.3)  #: pause after which a request counts as a new press rather than a repeat
+SETTLE_NS: Final = nanoseconds(0.5)  #: reports that arrive sooner than this after the press may be older than it
 
 
 class MotorStop:
-    """One emergency stop of any driver, from the press until it is reset or abandoned.
+    """One emergency stop, for any driver, from the press until it is reset or abandoned.
 
-    A driver knows how to tell that the motors are off and which bytes stop them; everything else is decided here. While
-    it is :attr:`active`, the driver sends and obeys nothing else. The stop is sent at once, whether or not the vehicle
-    is sending data, and again every 0.1 s until the vehicle confirms it; until then, the state reported is the
-    vehicle's own. If the vehicle has not confirmed it 10 s after the press, the stop is abandoned, because it must not
-    be sent minutes later and the vehicle must be free to land. Not thread-safe.
+    A driver knows how to detect that the motors are off, and which bytes stop them. This class decides everything else.
+    While the stop is :attr:`active`, the driver sends and obeys nothing else. The stop is sent immediately, whether or
+    not the vehicle is sending data, and then every 0.1 s until the vehicle confirms it. Until then, the reported state
+    is the vehicle's own. If the vehicle has not confirmed the stop 10 s after the press, the stop is abandoned: it must
+    not be sent minutes later, and the vehicle must be free to land. Not thread-safe.
     """
 
     def __init__(self, give_up: Callable[[VehicleEvent], None]) -> None:
         self._give_up = give_up
         self._begun_ns: int | None = None  # time of the first press
-        self._pressed_ns = 0  # time of the newest press, not counting repeats
-        self._heard_ns = 0  # time of the newest press, including repeats
+        self._pressed_ns = 0  # time of the newest press, without repeats
+        self._heard_ns = 0  # time of the newest press or repeat
         self._sent_ns: int | None = None
         self._shown = self._was_shown = False
 
     @property
     def active(self) -> bool:
-        """Whether the stop has been pressed and has since been neither reset nor abandoned."""
+        """Whether the stop was pressed and has been neither reset nor abandoned since then."""
         return self._begun_ns is not None
 
     @property
     def shown(self) -> bool:
-        """Whether the stop is active and the vehicle last reported its motors off; the state is then ``EMERGENCY``."""
+        """Whether the stop is active and the vehicle's last report says motors off; the state is then ``EMERGENCY``."""
         return self.active and self._shown
 
     def press(self, now_ns: int) -> None:
@@ -360,13 +360,13 @@ class MotorStop:
         self._heard_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
-        """Return whether a report received at ``seen_ns`` must have been sent after the press."""
+        """Return whether the vehicle must have sent a report received at ``seen_ns`` after the press."""
         return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
-        """Advance an active stop; return whether to send it now. Call it at every tick, even if no telemetry arrived.
+        """Advance an active stop; return whether to send it now. Must be called at every tick, even without telemetry.
 
-        ``shown``: whether the vehicle reports that its motors are off; None if it has reported nothing new.
+        ``shown``: whether the vehicle reports that its motors are off; None if there is no new report.
         """
         if self._begun_ns is None:
             return False
@@ -386,7 +386,7 @@ class MotorStop:
     def reset(self) -> None:
         """Allow the motors to run again. Does nothing if no stop is active.
 
-        Raises :class:`DriverError` if the vehicle has not confirmed the stop, in which case it is still being sent.
+        Raises :class:`DriverError` if the vehicle has not confirmed the stop, which is then still being sent.
         """
         if self.active and not self.shown:
             raise DriverError("the motors still run, or are still armed: the stop has not shown yet")

@@ -1,4 +1,4 @@
-"""Frozen, typed samples for all channels, and their binary form.
+"""Define frozen, typed samples for all channels, and their binary form.
 
 SI units and radians; body axes x forward, y left, z up; world axes x east, y north, z up (ROS REP 103). Times are
 integer nanoseconds on the proxy's monotonic clock.

@@ -1,8 +1,8 @@
-"""Pure functions that encode samples as bytes and decode them; ``docs/wire-format.md`` has the byte tables.
+"""Encode samples as bytes and decode them, with pure functions; the byte tables are in ``docs/wire-format.md``.
 
-A packet is a 12-byte header (signature, version, kind, reserved, body length) and a body: the sample's fields in order,
-as one MessagePack array. msgspec encodes, decodes and checks types, lengths and ranges in C. Older readers skip fields
-that a later version has added at the end of a sample.
+A packet is a 12-byte header (signature, version, kind, reserved, body length) followed by a body: the sample's fields
+in order, as one MessagePack array. msgspec encodes and decodes, and checks types, lengths and ranges in C. Older
+readers skip fields that a later version added at the end of a sample.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
 HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
-MAX_BODY: Final = 60_000  #: bytes in a body, so that a packet fits into one datagram; pixels are sent separately
+MAX_BODY: Final = 60_000  #: maximum size of a body [bytes], which fits into one datagram; pixels are sent separately
 
-#: All types of sample that a packet can hold, in the order of :class:`Kind`.
+#: All types of samples that a packet can contain, in the order of :class:`Kind`.
 Sample = (
     Command
     | Feedback
@@ -47,7 +47,7 @@ Sample = (
 
 
 class Kind(IntEnum):
-    """Kinds of packets. 0x40 and above belong to the transports and never reach this codec."""
+    """Kinds of packets. Values from 0x40 belong to the transports and never reach this codec."""
 
     COMMAND = 1
     FEEDBACK = 2
@@ -92,11 +92,11 @@ def encode(sample: Sample) -> bytes:
 
 
 def decode(packet: bytes | memoryview) -> Sample:
-    """Decode a packet from any source, in bounded time and memory, and check its types, lengths and ranges.
+    """Decode a packet from any source in bounded time and memory, and check its types, lengths and ranges.
 
-    Raises :class:`DecodeError` if the bytes are not a packet with a valid sample.
+    Raises :class:`DecodeError` if the bytes are not a packet that contains a valid sample.
     """
-    # A single look-up checks signature, version, kind and reserved bytes; only failures are analysed further.
+    # A single look-up checks the signature, version, kind and reserved bytes; only failures are analysed further.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
     size = len(packet) - HEADER_SIZE
     if decoder is None or not 0 <= size <= MAX_BODY or _unpack_length(packet, _PREFIX_SIZE)[0] != size:

@@ -1,7 +1,7 @@
-"""Samples from an application to the vehicle: commands, their outcomes, and externally measured poses.
+"""Define the samples sent to the vehicle: commands, their outcomes, and externally measured poses.
 
-Each command carries the full desired state; the newest wins. Axes are the body's (ROS REP 103): x forward, y left, z
-up; yaw is counter-clockwise seen from above.
+Each command describes the full desired state, and the newest command wins. Axes are the body axes (ROS REP 103): x
+forward, y left, z up; yaw is counter-clockwise seen from above.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import msgspec
 from skyloop.errors import UsageError
 from skyloop.messages.fields import Count, Refusal, TimeNs
 
-MAX_RANGE_M: Final = 100_000.0  #: a position beyond this along any axis is rejected as a mistake [m]
-MAX_YAW_RAD: Final = 1000.0  #: a yaw larger than this is rejected, too [rad]
+MAX_RANGE_M: Final = 100_000.0  #: a coordinate larger than this is rejected as a mistake [m]
+MAX_YAW_RAD: Final = 1000.0  #: a yaw larger than this is also rejected [rad]
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -35,12 +35,12 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def problem(self) -> str:
-        """Human-readable reason why the numbers are not valid; empty if the vehicle can fly them."""
+        """Human-readable reason why the numbers are invalid; empty if the vehicle can fly them."""
         return ""
 
 
 class Idle(Action, frozen=True, array_like=True, tag=0):
-    """Do nothing: keeps the authority alive and leaves the vehicle as it is."""
+    """Do nothing: keep the authority without changing what the vehicle does."""
 
 
 class Takeoff(Action, frozen=True, array_like=True, tag=1):
@@ -48,7 +48,7 @@ class Takeoff(Action, frozen=True, array_like=True, tag=1):
 
 
 class Hover(Action, frozen=True, array_like=True, tag=2):
-    """Stop and hold the position."""
+    """Stop and hold position."""
 
 
 class Land(Action, frozen=True, array_like=True, tag=3):
@@ -56,18 +56,18 @@ class Land(Action, frozen=True, array_like=True, tag=3):
 
 
 class EmergencyStop(Action, frozen=True, array_like=True, tag=4):
-    """Cut the motors at once: the vehicle falls. No lease is needed."""
+    """Cut the motors immediately: the vehicle falls. Requires no lease."""
 
 
 class ResetEmergency(Action, frozen=True, array_like=True, tag=5):
-    """Leave the emergency state while on the ground. The library never sends it automatically."""
+    """Leave the emergency state while on the ground. The library never sends this automatically."""
 
 
 class Attitude(Action, frozen=True, array_like=True, tag=6):
-    """A set-point that makes the vehicle hold an attitude while it climbs and turns.
+    """A set-point that holds an attitude while the vehicle climbs and turns.
 
-    ``roll`` [rad] is positive with the right side down, ``pitch`` [rad] with the nose down (REP 103: about y, left),
-    ``climb`` [m/s] upwards, ``yaw_rate`` [rad/s] counter-clockwise.
+    ``roll`` [rad] is positive with the right side down, ``pitch`` [rad] is positive with the nose down (REP 103: about
+    y, left), ``climb`` [m/s] is upwards, and ``yaw_rate`` [rad/s] is counter-clockwise.
     """
 
     roll: float = 0.0
@@ -81,7 +81,7 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
 
 class Velocity(Action, frozen=True, array_like=True, tag=7):
-    """A set-point in the body's levelled axes: velocity ``forward``, ``left``, ``up`` [m/s]; ``yaw_rate`` [rad/s]."""
+    """A velocity set-point in the levelled body axes: ``forward``, ``left``, ``up`` [m/s] and ``yaw_rate`` [rad/s]."""
 
     forward: float = 0.0
     left: float = 0.0
@@ -94,7 +94,7 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
 
 class Position(Action, frozen=True, array_like=True, tag=8):
-    """A set-point that flies to a position and holds it, in the world axes of ``Feedback.position``.
+    """A set-point that flies to a position and holds it, in the same world axes as ``Feedback.position``.
 
     ``x`` is east, ``y`` north, ``z`` up [m]; ``yaw`` is counter-clockwise from x [rad], or None to keep the heading.
     ``speed`` [m/s] and ``turn_rate`` [rad/s] are upper bounds; None means as fast as the limits allow.
@@ -133,10 +133,10 @@ class Position(Action, frozen=True, array_like=True, tag=8):
 
 
 class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
-    """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or hover there.
+    """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land there or hover above it.
 
-    ``height`` [m] is the minimum height above the start on the way; ``land`` selects landing at the end rather than
-    hovering. If these are None, the proxy's parameters ``return.height`` and ``return.land`` apply.
+    ``height`` [m] is the minimum height above the start during the flight; ``land`` selects landing rather than
+    hovering at the end. If these are None, the proxy's parameters ``return.height`` and ``return.land`` apply.
     """
 
     height: float | None = None
@@ -157,7 +157,7 @@ AnyAction = (
     Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position | ReturnToStart
 )
 
-#: Actions that set where or how fast to fly. Each replaces the previous one, and programs send them periodically.
+#: Actions that set where to fly, or how fast. Each replaces the previous one, and programs send them periodically.
 SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
 
 ACTION_NAMES: dict[type[Action], str] = {
@@ -175,23 +175,23 @@ ACTION_NAMES: dict[type[Action], str] = {
 
 
 class Command(msgspec.Struct, frozen=True, array_like=True):
-    """One packet of the command channel, with the action that the vehicle is to execute.
+    """One packet of the command channel, containing the action that the vehicle is to execute.
 
-    A packet whose ``seq`` is not higher than all earlier ones is refused, unless it stops the motors.
+    A packet is refused unless its ``seq`` is higher than that of every earlier packet, or it stops the motors.
     """
 
-    seq: Count  #: increases with every packet of a connection
-    lease: Count  #: number of the lease under which it is sent; 0 if there is none (emergency stop only)
-    intent: Count  #: increases with each request by the *application*; the library's repeats keep it
-    sent_ns: int  #: sending time on the proxy's clock; unchecked, because emergency stops are valid at any time
+    seq: Count  #: increases with every packet sent on a connection
+    lease: Count  #: number of the sender's lease; 0 if there is none (emergency stop only)
+    intent: Count  #: increases with each request by the *application*; the library's repeats don't change it
+    sent_ns: int  #: sending time on the proxy's clock; not checked, because an emergency stop is always valid
     action: AnyAction
     automatic: bool = (
-        False  #: requested by the library, not by a person or a program, and so never takes a vehicle from others
+        False  #: whether the library itself requests it; then it never takes a vehicle from other applications
     )
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):
-    """Echo on the ``commands`` topic: a command received by the proxy, and what the proxy applied."""
+    """Echo on the ``commands`` topic: a command that the proxy received, and what the proxy applied."""
 
     seq: Count
     lease: Count
@@ -199,14 +199,14 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: TimeNs
     applied_ns: TimeNs
     asked: AnyAction
-    applied: AnyAction  #: the action as limited and applied by the driver
+    applied: AnyAction  #: action as limited and applied by the driver
 
 
 MAX_OUTCOME_TEXT: Final = 300  #: maximum length of an outcome's text [characters]
 
 
 class Fate(StrEnum):
-    """What became of an intent: in progress, or how it ended. A repeat never executes an intent that has ended."""
+    """State of an intent: in progress, or how it ended. Repeating an intent that has ended never executes it."""
 
     UNDER_WAY = "under_way"
     COMPLETED = "completed"
@@ -224,7 +224,7 @@ class Fate(StrEnum):
     JUMPED = "jumped"
 
 
-#: The single list of everything that can end an intent, in readable form; ``docs/proxy.md`` is generated from it.
+#: The single list of everything that can end an intent, in readable form; it generates part of ``docs/proxy.md``.
 ENDINGS: Final[dict[Fate, str]] = {
     Fate.COMPLETED: "it was carried out",
     Fate.REFUSED: "it was refused",
@@ -243,13 +243,13 @@ ENDINGS: Final[dict[Fate, str]] = {
 
 
 class Outcome(msgspec.Struct, frozen=True, array_like=True):
-    """Outcome of the newest intent of the application that is commanding or was the last to command."""
+    """Outcome of the newest intent of the application that commands the vehicle, or was the last to do so."""
 
     app_id: Count = 0  #: number of the application in this run of the proxy; 0: no intent to report
-    intent: Count = 0  #: number of the intent, as in the commands for it
+    intent: Count = 0  #: number of the intent, as in its commands
     fate: Fate = Fate.UNDER_WAY
     reason: Refusal | None = None  #: why the intent, or a repeat of it, was refused
-    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: the reason in readable form
+    text: Annotated[str, msgspec.Meta(max_length=MAX_OUTCOME_TEXT)] = ""  #: human-readable reason
 
     @property
     def over(self) -> bool:
@@ -258,16 +258,16 @@ class Outcome(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def failed(self) -> bool:
-        """Whether the intent ended without being carried out."""
+        """Whether the intent ended without being completed."""
         return self.over and self.fate is not Fate.COMPLETED
 
 
 class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
-    """A measured pose that the pilot's application sends to the vehicle. World axes are x east, y north, z up."""
+    """A measured pose of the vehicle, sent to it by the pilot's application. World axes: x east, y north, z up."""
 
     captured_ns: TimeNs  #: time of the measurement, on the proxy's clock
     position_m: tuple[float, float, float]  #: position of the body's origin [m]
-    quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
+    quaternion: tuple[float, float, float, float]  #: x, y, z, w of the rotation from body axes to world axes
     position_std_m: float | None = None  #: standard deviation of the position [m], if known
     attitude_std_rad: float | None = None  #: standard deviation of the attitude [rad], if known
 
@@ -278,9 +278,9 @@ def check_pose(
     position_std_m: float | None = None,
     attitude_std_rad: float | None = None,
 ) -> None:
-    """Check a pose: position x, y, z [m]; quaternion x, y, z, w; standard deviations [m, rad], None if unknown.
+    """Check a pose: position x, y, z [m]; quaternion x, y, z, w; standard deviations [m, rad] or None if unknown.
 
-    Raises :class:`UsageError` if a number is missing or not finite, a standard deviation is negative, or the
+    Raises :class:`UsageError` if a number is missing or not finite, if a standard deviation is negative, or if the
     quaternion's length differs from 1 by more than 0.001.
     """
     for name, axes, values in (("position", "x, y, z", position), ("quaternion", "x, y, z, w", quaternion)):

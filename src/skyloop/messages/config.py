@@ -1,4 +1,4 @@
-"""The configuration channel: each typed request gets one typed answer."""
+"""Define the messages of the configuration channel: each typed request gets one typed answer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from skyloop.messages.relayed import MAX_CODE, ProcessorName
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
 LONGEST_TERM_S = 86_400.0
 Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
-MAX_REASON = 200  #: characters in a holder's reason for declining
+MAX_REASON = 200  #: maximum length of a holder's reason for declining [characters]
 ClockName = Annotated[str, msgspec.Meta(max_length=64)]
 Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
@@ -24,10 +24,10 @@ LOWEST_PRIORITY = 31
 
 
 class Capabilities(msgspec.Struct, frozen=True, array_like=True):
-    """What a vehicle can do and which cameras it has; known before the driver opens it."""
+    """What a vehicle can do and which cameras it has, known before the driver opens the vehicle."""
 
     vehicle: str  #: the vehicle's family, e.g. ``sim`` or ``ardrone2``
-    actions: frozenset[str] = frozenset()  #: names of actions that the vehicle itself supports; empty if it can't fly
+    actions: frozenset[str] = frozenset()  #: names of actions that the vehicle itself supports; empty: it can't fly
     cameras: tuple[CameraInfo, ...] = ()
     description: str = ""
     why_not: str = ""  #: human-readable reason why the vehicle can't fly
@@ -38,9 +38,9 @@ class Capabilities(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """First request of a connection."""
+    """First request on a connection."""
 
-    name: Name  #: the application's name, for display
+    name: Name  #: name of the application, for display
     role: Role = Role.PILOT
 
 
@@ -48,13 +48,13 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     """Request the authority."""
 
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: whether to queue if another application holds the authority; if False, be refused
-    for_s: Term | None = None  #: how long the application needs it after the grant [s]; nil: until it gives it back
+    queue: bool = True  #: whether to queue if another application holds the authority; if False, the request is refused
+    for_s: Term | None = None  #: how long the application needs the authority [s]; nil: until it releases it
     takeover: Takeover = Takeover.NOW
 
 
 class ReleaseAuthority(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """Give the authority back, or leave the queue."""
+    """Release the authority, or leave the queue."""
 
 
 class GetParameter(msgspec.Struct, frozen=True, array_like=True, tag=4):
@@ -68,7 +68,7 @@ class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
 
     name: ParameterName
     value: Value
-    lease: Count  #: the sender's lease, because writing needs the authority
+    lease: Count  #: lease of the sender; writing requires the authority
 
 
 class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
@@ -78,7 +78,7 @@ class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
 
 
 class Ping(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """Ask for the proxy's time, to estimate the clock offset and to check that the proxy is alive."""
+    """Ask for the proxy's time to estimate the clock offset and check that the proxy is alive."""
 
     sent_ns: TimeNs  #: time of sending, on the requester's clock
 
@@ -88,24 +88,24 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
 
 
 class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
-    """Join the workers of a processor, or remain one: workers repeat this several times a second while they run.
+    """Join the workers of a processor, or remain a worker; workers repeat this several times a second.
 
-    The answer is :class:`Done`; a :class:`ProcessorShare` announces which of the frames the worker gets.
+    The answer is :class:`Done`; a :class:`ProcessorShare` tells the worker which frames it gets.
     """
 
     processor: ProcessorName
     code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: identifies the code that all workers of a processor run
     camera: Name
-    shared: bool = True  #: whether each frame goes to only one worker, rather than to all of them
-    ready: bool = True  #: False: this worker can't take frames at present, so other workers get them
+    shared: bool = True  #: whether each frame goes to one worker only, rather than to all workers
+    ready: bool = True  #: False: this worker can't take frames now, and other workers get them
 
 
 class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
-    """The holder's answer to an application that requests the authority."""
+    """Answer of the holder to an application that requests the authority."""
 
-    lease: Count  #: the holder's own lease
-    app_id: Count  #: number of the application that asked
-    grant: bool  #: whether to hand the authority over now; False: not yet
+    lease: Count  #: lease of the holder itself
+    app_id: Count  #: number of the requesting application
+    grant: bool  #: whether to hand over the authority now; False: not yet
     reason: Reason = ""  #: human-readable reason for declining
 
 
@@ -124,9 +124,9 @@ AnyRequest = (
 
 
 class Request(msgspec.Struct, frozen=True, array_like=True):
-    """One request, with a number that identifies its reply."""
+    """One request, numbered to identify its reply."""
 
-    id: Count  #: chosen by the requester; the answer repeats it
+    id: Count  #: number chosen by the requester; the answer repeats it
     body: AnyRequest
 
 
@@ -138,12 +138,12 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
     app_id: Count  #: the application's number in this run of the proxy, from 1
     proxy: Name
-    run_id: Count  #: random; a different number means that the proxy has restarted
+    run_id: Count  #: random number; a different number means that the proxy has restarted
     pid: Count
     uri: str  #: the vehicle's address
     now_ns: TimeNs  #: current time on the proxy's clock
     capabilities: Capabilities
-    clock: ClockName = ""  #: identity of that clock, one of the host's monotonic clocks; empty: unknown
+    clock: ClockName = ""  #: identity of that clock, which is one of the host's monotonic clocks; empty: unknown
 
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
@@ -159,18 +159,18 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     position: Count  #: position in the queue; 1 is next
     holder: str
     holder_priority: Priority
-    wait_s: float | None = None  #: estimated from the times for which the others requested it [s]; nil: unknown
+    wait_s: float | None = None  #: estimated from the times for which others requested the authority [s]; nil: unknown
     asked: bool = False  #: whether the holder is being asked to hand over the authority
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A parameter's value, as read or as it is after a write."""
+    """A parameter's value, either as read or after a write."""
 
     parameter: Parameter
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
-    """A page of the parameters; ``total`` is the number of parameters, ``first`` the index of this page's first."""
+    """A page of the parameters; ``total`` is the number of all parameters, ``first`` the index of its first one."""
 
     total: Count
     first: Count
@@ -189,7 +189,7 @@ class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The request was refused; ``message`` is the reason in readable form."""
+    """The request was refused; ``message`` gives the reason in readable form."""
 
     code: Refusal
     message: str

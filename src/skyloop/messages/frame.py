@@ -1,6 +1,6 @@
-"""Video samples: frame headers and the encoded frames of streams; also functions for the size of image files.
+"""Define video samples: frame headers and the encoded frames of streams. Also read the size of image files.
 
-A stream holds frames as encoded by the vehicle or by the proxy. It runs only while it has subscribers.
+A stream contains frames as the vehicle or the proxy encoded them. A stream runs only while it has subscribers.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-H264: Final = "h264"  #: the only codec recorded without being decoded
-#: Maximum number of bytes of a frame in one packet, which also holds the other fields.
+H264: Final = "h264"  #: the only codec that is recorded without decoding
+#: Maximum number of bytes of a frame in one packet, which also contains the other fields.
 MAX_PIECE: Final = 57_000
 MAX_PIECES: Final = 64
 MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a complete frame [bytes]
@@ -26,13 +26,13 @@ Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
 class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
-    """A camera's intrinsics in OpenCV's convention, in pixels of the accompanying frame."""
+    """A camera's intrinsics in the OpenCV convention, in pixels of the accompanying frame."""
 
     fx: Finite
     fy: Finite
     cx: Finite
     cy: Finite
-    #: k1, k2, p1, p2[, k3, …] (pinhole) or k1 … k4 (fisheye)
+    #: k1, k2, p1, p2[, k3, …] for a pinhole model, or k1 … k4 for a fisheye model
     distortion: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=14)] = ()
     model: str = "pinhole"  #: ``pinhole`` or ``fisheye``
 
@@ -45,16 +45,16 @@ class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
 
 
 class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
-    """Header of one frame, whose pixels are sent separately."""
+    """Header of one frame; the pixels are sent separately."""
 
     camera: Name
     seq: Count  #: increases by one with each frame of this camera, including dropped ones
     captured_ns: TimeNs  #: middle of the exposure, as accurately as the vehicle reports it, on the proxy's clock
-    published_ns: TimeNs  #: when the proxy received it
+    published_ns: TimeNs  #: time at which the proxy received the frame
     width: Pixels
     height: Pixels
     encoding: Encoding
-    size: Count  #: number of bytes of pixels
+    size: Count  #: number of bytes of pixel data
     intrinsics: Intrinsics | None = None
 
 
@@ -67,52 +67,52 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     fps: Finite  #: nominal frame rate
     encoding: Encoding = Encoding.BGR8
     intrinsics: Intrinsics | None = None
-    #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
+    #: rotation from the camera's optical axes (x right, y down, z forward) to the body axes, row by row
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
     position_m: tuple[Finite, Finite, Finite] | None = None  #: position of the optical centre in body axes [m]
-    stream: str = ""  #: codec of frames available without decoding, ``h264``; empty if there are none
+    stream: str = ""  #: codec of the frames available without decoding (``h264``); empty if there are none
 
 
 class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
-    """An encoded frame; for H.264, an access unit in Annex B format, with parameter sets if it is a key frame.
+    """An encoded frame. For H.264 it is an access unit in Annex B format; a key frame includes the parameter sets.
 
-    A frame larger than a packet is sent in pieces, each an ``EncodedFrame``. Every frame except a key frame refers to
-    the previous one, so after a gap in ``seq`` nothing can be decoded before the next key frame. Frames never refer to
-    later ones. A frame decoded from it has the same ``captured_ns`` but its own ``seq``.
+    A frame that exceeds one packet is sent in pieces, each of which is an ``EncodedFrame``. Every frame except a key
+    frame depends on the previous frame. After a gap in ``seq``, nothing can be decoded until the next key frame. Frames
+    never depend on later frames. The decoded frame has the same ``captured_ns`` but its own ``seq``.
     """
 
     camera: Name
-    seq: Count  #: number of the frame in the stream, which also counts frames too large for a packet
+    seq: Count  #: number of the frame in the stream, counting also frames that were too large to send
     captured_ns: TimeNs  #: capture time, the same as that of the decoded frame
     published_ns: TimeNs  #: when the proxy received it
     width: Pixels  #: width of the decoded frame
     height: Pixels
     codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
-    key: bool  #: whether it can be decoded without earlier frames
+    key: bool  #: whether the frame can be decoded without earlier frames
     data: Annotated[bytes, msgspec.Meta(max_length=MAX_ENCODED)]  #: one packet holds at most :data:`MAX_PIECE` bytes
     intrinsics: Intrinsics | None = None
-    topic: Topic = ""  #: topic of the frame; empty: ``stream/CAMERA``, as encoded by the vehicle
+    topic: Topic = ""  #: topic of the frame; empty: ``stream/CAMERA``, frames as encoded by the vehicle
     piece: Annotated[int, msgspec.Meta(ge=0, lt=MAX_PIECES)] = 0
     pieces: Annotated[int, msgspec.Meta(ge=1, le=MAX_PIECES)] = 1
 
     def decoded(self, width: int, height: int) -> FrameHeader:
-        """Return the header of the frame decoded from this one, a BGR image of this size [px]."""
+        """Return the header of the BGR image of this size [px] that is decoded from this frame."""
         same = (width, height) == (self.width, self.height)
         times = (self.captured_ns, self.published_ns)
-        lens = self.intrinsics if same else None  # the intrinsics are valid for the announced size
+        lens = self.intrinsics if same else None  # the intrinsics apply to the announced size
         return FrameHeader(self.camera, self.seq, *times, width, height, Encoding.BGR8, width * height * 3, lens)
 
 
 class StreamReport(msgspec.Struct, frozen=True, array_like=True):
-    """A subscriber's report on a stream that the proxy encodes. If a report is lost, the next one makes up for it."""
+    """A subscriber's report about a stream that the proxy encodes. The next report makes up for a lost one."""
 
     topic: Topic
-    seq: Count  #: number of the newest frame received completely; 0 if there is none yet
-    wants_key: bool = False  #: whether the subscriber can't decode anything until the next key frame
+    seq: Count  #: number of the newest completely received frame; 0 if there is none yet
+    wants_key: bool = False  #: whether the subscriber can't decode anything before the next key frame
 
 
 def split(picture: EncodedFrame) -> Iterator[EncodedFrame]:
-    """Yield the pieces of a frame in order, or the frame itself if it fits into a packet."""
+    """Yield the pieces of a frame in order, or the frame itself if it fits into one packet."""
     pieces = -(-len(picture.data) // MAX_PIECE)
     if pieces <= 1:
         yield picture
@@ -129,7 +129,7 @@ class Pieces:
         self._parts: list[EncodedFrame] = []
 
     def add(self, part: EncodedFrame) -> EncodedFrame | None:
-        """Add a piece; return the frame if this completes it."""
+        """Add a piece; return the frame if this piece completes it."""
         if part.pieces == 1:
             self._parts.clear()
             return part
@@ -148,10 +148,10 @@ class Pieces:
 
 
 class Chain:
-    """Decides which frames of a stream are decodable: key frames, and those that follow without a gap."""
+    """Decides which frames of a stream can be decoded: key frames, and frames that follow without a gap."""
 
     def __init__(self) -> None:
-        self._last: int | None = None  # None while waiting for a key frame
+        self._last: int | None = None  # None while a key frame is awaited
 
     def follows(self, number: int, *, key: bool) -> bool:
         """Return whether the next frame received, numbered ``seq``, can be decoded; False for duplicates."""
@@ -166,12 +166,12 @@ class Chain:
         self._last = None
 
 
-# The size is read from a JPEG's or PNG's header before decoding: decoders reserve memory for the announced size, so a
-# file of a few kilobytes could claim gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
+# The size is read from the header of a JPEG or PNG before decoding: decoders reserve memory for the announced size, and
+# a file of a few kilobytes could announce gigabytes. ITU-T T.81 (JPEG), annex B; W3C PNG, section 5.
 
-#: Maximum size of an image to decode: 8K UHD (100 MB as BGR), far more than any small drone's camera has.
+#: Maximum size of an image to decode: 8K UHD (100 MB as BGR), far more than the camera of any small drone delivers.
 MAX_PIXELS: Final = 7680 * 4320
-#: Maximum number of scans in a progressive JPEG, each of which covers the whole image; encoders make about ten.
+#: Maximum number of scans in a progressive JPEG. Each scan covers the whole image, and encoders produce about ten.
 MAX_SCANS: Final = 100
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -183,7 +183,7 @@ _ENDS: Final = frozenset({0xD8, 0xD9, 0xDA})  #: markers that end a header: anot
 
 
 def image_size(data: bytes | memoryview) -> tuple[int, int] | None:
-    """Return width and height [px] from the header of a JPEG or PNG; None if it is damaged or of another format."""
+    """Return width and height [px] from the header of a JPEG or PNG; None if it is damaged or has another format."""
     if data[:8] == _PNG:
         if data[12:16] != b"IHDR" or len(data) < 24:
             return None
@@ -210,7 +210,7 @@ def why_not_decoded(data: bytes | memoryview) -> str:
 def _jpeg_size(data: bytes | memoryview) -> tuple[int, int] | None:
     at = 2
     while at + 4 <= len(data):
-        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, or bytes that decoders skip
+        if data[at] != 0xFF or data[at + 1] in (0x00, 0xFF):  # fill bytes, or bytes that decoders skip over
             at += 1
             continue
         marker = data[at + 1]

@@ -1,6 +1,6 @@
-"""Pure functions for bounded numbers, angles, rotation matrices and quaternions, in the axes of ROS REP 103.
+"""Compute with bounded numbers, angles, rotation matrices and quaternions, in the axes of ROS REP 103.
 
-Limits never pass NaN through: they treat it as 0 or, if 0 is out of range, as the limit closest to 0.
+Limits never pass on NaN: they treat it as 0 or, if 0 is out of range, as the limit closest to 0.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ _Angle = TypeVar("_Angle", float, NDArray[np.float64])
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
-    """Return the rotation from body to world axes, shape (3, 3): ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``.
+    """Return the rotation from body axes to world axes, shape (3, 3): ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``.
 
-    Angles [rad] are positive for the right side down, the nose down, and counter-clockwise seen from above.
+    Angles [rad] are positive with the right side down, with the nose down, and counter-clockwise seen from above.
     """
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
@@ -45,7 +45,7 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float,
 
 
 def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return roll, pitch (within ±π/2) and yaw [rad] of a rotation from body to world axes, shape (3, 3)."""
+    """Return roll, pitch (within ±π/2) and yaw [rad] of a rotation from body axes to world axes, shape (3, 3)."""
     pitch = math.asin(max(-1.0, min(1.0, -float(rotation[2, 0]))))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     yaw = math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
@@ -58,21 +58,21 @@ def wrap_angle(angle: _Angle) -> _Angle:
 
 
 def turned(x: float, y: float, angle: float) -> tuple[float, float]:
-    """Rotate a vector by an angle, counter-clockwise [rad]; the yaw turns levelled body axes into world axes."""
+    """Rotate a vector by an angle [rad], counter-clockwise; the yaw turns levelled body axes into world axes."""
     cos, sin = math.cos(angle), math.sin(angle)
     return cos * x - sin * y, sin * x + cos * y
 
 
 def within(value: float, low: float, high: float) -> float:
-    """Return the nearest value between ``low`` and ``high``; NaN counts as 0."""
+    """Limit ``value`` to the range from ``low`` to ``high``; NaN counts as 0."""
     return max(low, min(high, 0.0 if math.isnan(value) else value))
 
 
 def clamped(value: float, longest: float) -> float:
-    """Return the nearest value within ±``longest``; NaN counts as 0."""
+    """Limit ``value`` to ±``longest``; NaN counts as 0."""
     return within(value, -longest, longest)
 
 
 def in_16_bits(value: float) -> int:
-    """Return the nearest integer that fits into a signed 16-bit field."""
+    """Round and limit ``value`` to a signed 16-bit integer."""
     return round(within(value, -0x8000, 0x7FFF))

@@ -1,6 +1,6 @@
-"""Parameters, two of which are read-only and hold structured text: a vehicle's checkup and its world.
+"""Define parameters. Two of them are read-only and contain structured text: a vehicle's checkup and its world.
 
-A parameter has a type, a unit, a range and a default, so that both people and web pages can edit it.
+A parameter has a type, a unit, a range and a default, which lets both people and web pages edit it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ParameterType(StrEnum):
 
 
 class Parameter(msgspec.Struct, frozen=True, array_like=True):
-    """One parameter: its present value, and the rules for a new one."""
+    """One parameter: its current value, and the rules for a new value."""
 
     name: ParameterName
     type: ParameterType
@@ -37,16 +37,16 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     minimum: float | None = None
     maximum: float | None = None
     default: Value | None = None
-    choices: tuple[Value, ...] = ()  #: the only allowed values, if not empty
+    choices: tuple[Value, ...] = ()  #: the only allowed values; empty if others are allowed
     read_only: bool = False
     description: str = ""
-    momentary: bool = False  #: writing it triggers an action such as a flip; there is no value to restore or repeat
+    momentary: bool = False  #: whether writing it triggers an action, such as a flip; it has no lasting value
 
 
-# What a driver finds out about its vehicle before a flight.
+# What a driver learns about its vehicle before a flight.
 
-CHECKUP: Final = "vehicle.checkup"  #: the parameter's name
-MAX_CHECKUP_TEXT: Final = 7000  #: characters in the text, so that it fits into a parameter's packet
+CHECKUP: Final = "vehicle.checkup"  #: name of the parameter
+MAX_CHECKUP_TEXT: Final = 7000  #: maximum length of the text [characters], which fits into a parameter's packet
 
 _Text = Annotated[str, msgspec.Meta(max_length=600)]
 
@@ -54,18 +54,18 @@ _Text = Annotated[str, msgspec.Meta(max_length=600)]
 class Diagnostic(msgspec.Struct, frozen=True, array_like=True):
     """A finding about a vehicle or its settings that matters before a flight."""
 
-    what: _Text  #: what was examined
+    what: _Text  #: subject of the examination
     good: bool  #: whether the result is good
     detail: _Text  #: the result
-    advice: _Text = ""  #: what to do about it; empty if there is nothing to do
-    severe: bool = False  #: whether it is dangerous or sure to fail, not just a disabled safety net
+    advice: _Text = ""  #: what to do about it; empty if no action is needed
+    severe: bool = False  #: whether it is dangerous or certain to fail, rather than just a disabled safety net
 
 
 _checkup_decoder = msgspec.json.Decoder(list[Diagnostic])
 
 
 def encode_checkup(diagnostics: list[Diagnostic]) -> str:
-    """Encode diagnostics as a parameter's text; if it gets too long, drop good ones first."""
+    """Encode diagnostics as a parameter's text; if the text gets too long, drop good diagnostics first."""
     kept = list(diagnostics)
     while len(text := _encode_json(kept).decode()) > MAX_CHECKUP_TEXT:
         kept.remove(next((one for one in reversed(kept) if one.good), kept[-1]))
@@ -73,13 +73,13 @@ def encode_checkup(diagnostics: list[Diagnostic]) -> str:
 
 
 def decode_checkup(text: str) -> list[Diagnostic]:
-    """Decode the diagnostics in a parameter's text. Raises ``ValueError`` if the text does not contain any."""
+    """Decode diagnostics from a parameter's text. Raises ``ValueError`` if the text contains none."""
     return _checkup_decoder.decode(text.encode())
 
 
-# The world around a vehicle, for maps: walls, solids, gates, markers, starts. Drivers that know their surroundings
-# publish it. World axes are those of `Feedback.position_m`: x east, y north, z up [m]; yaw 0 faces east,
-# counter-clockwise [rad]. It is for display only, never for control.
+# The world around a vehicle, for maps: walls, solids, gates, markers and start positions. Drivers that know their
+# surroundings publish it in a parameter. The world axes are those of `Feedback.position_m`: x east, y north, z up [m];
+# yaw is counter-clockwise [rad], and 0 faces east. It is only for display, never for control.
 
 WORLD: Final = "world.geometry"  #: the parameter's name
 MAX_WORLD_TEXT: Final = 8000  #: characters in the text, so that it fits into a parameter's packet
@@ -90,7 +90,7 @@ _Vec = tuple[Finite, Finite, Finite]
 
 
 class Solid(msgspec.Struct, frozen=True, array_like=True):
-    """An upright box: its centre, its extents along its own x, y, z, and its yaw."""
+    """An upright box: its centre, its extents along its own x, y and z axes, and its yaw."""
 
     name: _Name
     position: _Vec
@@ -99,7 +99,7 @@ class Solid(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Opening(msgspec.Struct, frozen=True, array_like=True):
-    """A gate: the centre, width and height of its opening, the direction of flight, and its bars' thickness."""
+    """A gate: the centre, width and height of its opening, the direction of flight, and the thickness of its bars."""
 
     name: _Name
     position: _Vec
@@ -109,7 +109,7 @@ class Opening(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Card(msgspec.Struct, frozen=True, array_like=True):
-    """A marker: its centre, its edge, and its outward normal's heading and angle above the horizon."""
+    """A marker: its centre, its edge length, and the heading and elevation of its outward normal."""
 
     name: _Name
     position: _Vec
@@ -127,7 +127,7 @@ class Start(msgspec.Struct, frozen=True, array_like=True):
 
 
 class WorldGeometry(msgspec.Struct, frozen=True):
-    """The whole world. ``low`` and ``high`` are corners of the room; ``enclosed`` means that it has visible walls."""
+    """A whole world. ``low`` and ``high`` are corners of the room; ``enclosed``: whether it has visible walls."""
 
     name: _Name = ""
     low: _Vec | None = None
@@ -137,14 +137,14 @@ class WorldGeometry(msgspec.Struct, frozen=True):
     gates: Annotated[tuple[Opening, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     markers: Annotated[tuple[Card, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
     starts: Annotated[tuple[Start, ...], msgspec.Meta(max_length=MAX_THINGS)] = ()
-    left_out: int = 0  #: number of objects omitted for lack of space in the text
+    left_out: int = 0  #: number of objects omitted because the text has no space for them
 
 
 _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Encode a world as a parameter's text; if it gets too long, omit the last solids and markers."""
+    """Encode a world as a parameter's text; if the text gets too long, omit the last solids and markers."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)
@@ -155,5 +155,5 @@ def encode_world(world: WorldGeometry) -> str:
 
 
 def decode_world(text: str) -> WorldGeometry:
-    """Decode the world in a parameter's text. Raises ``ValueError`` if the text does not describe a world."""
+    """Decode a world from a parameter's text. Raises ``ValueError`` if the text describes no world."""
     return _world_decoder.decode(text.encode())

@@ -1,4 +1,4 @@
-"""Samples that applications publish through the proxy: frame annotations, log entries and processors' results.
+"""Define samples that applications publish through the proxy: frame annotations, log entries, processor results.
 
 The proxy relays them on the topics ``annotations``, ``logs``, ``results`` (of all processors) and ``results/NAME``.
 """
@@ -15,7 +15,7 @@ from skyloop.messages.fields import Count, Finite, Name, Pixels, Severity, TimeN
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Annotations: drawings by a controller or processor on a frame; the newest wins. Coordinates are in frame pixels.
+# Annotations: drawings by a controller or a processor on a frame; the newest one wins. Coordinates are in frame pixels.
 
 Point = tuple[Finite, Finite]
 Channel = Annotated[int, msgspec.Meta(ge=0, le=255)]
@@ -24,7 +24,7 @@ GREEN: Colour = (64, 220, 100)
 
 
 class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """A line through points to draw on a frame; if closed, a polygon (a box has four points)."""
+    """A line through points, drawn on a frame; if closed, it is a polygon (a box has four points)."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=512)]
     closed: bool = False
@@ -32,14 +32,14 @@ class Polyline(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Points(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """Single points to draw on a frame."""
+    """Single points drawn on a frame."""
 
     points: Annotated[tuple[Point, ...], msgspec.Meta(max_length=1024)]
     colour: Colour = GREEN
 
 
 class Text(msgspec.Struct, frozen=True, array_like=True, tag=3):
-    """A text to draw next to a point on a frame."""
+    """Text drawn next to a point on a frame."""
 
     text: Annotated[str, msgspec.Meta(max_length=256)]
     at: Point
@@ -50,9 +50,9 @@ Shape = Polyline | Points | Text
 
 
 class Annotation(msgspec.Struct, frozen=True, array_like=True):
-    """Shapes that a tracker or controller draws over a frame, for people and recorders."""
+    """Shapes that a tracker or a controller draws over a frame, for people and recordings."""
 
-    source: Name  #: tracker or controller that drew it; only the newest annotation per source and camera is valid
+    source: Name  #: who drew the shapes; only the newest annotation for each source and camera is valid
     camera: Name
     captured_ns: TimeNs  #: capture time of the annotated frame
     width: Pixels  #: width of that frame
@@ -60,28 +60,28 @@ class Annotation(msgspec.Struct, frozen=True, array_like=True):
     shapes: Annotated[tuple[Shape, ...], msgspec.Meta(max_length=256)] = ()
 
 
-# Log entries: text, numbers and arrays, for recorders and plots.
+# Log entries: text, numbers and arrays, for recordings and plots.
 
-MAX_LOG_TEXT: Final = 4096  #: characters in a log entry's text
-MAX_VALUES: Final = 4096  #: numbers in an array
-#: Name of the series of poses from motion capture, in world axes: arrays of x, y, z [m], the quaternion x, y, z, w and,
-#: if known, the velocity x, y, z [m/s].
+MAX_LOG_TEXT: Final = 4096  #: maximum length of a log entry's text [characters]
+MAX_VALUES: Final = 4096  #: maximum number of values in an array
+#: Name of the series that contains poses from motion capture, in world axes: arrays of x, y, z [m], the quaternion x,
+#: y, z, w and, if known, the velocity x, y, z [m/s].
 MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):
-    """A log entry, which has exactly one of ``text``, ``number`` and ``values``.
+    """A log entry, which contains exactly one of ``text``, ``number`` and ``values``.
 
-    Raises ``ValueError`` if it has none or several of them, or if the shape does not match the values.
+    Raises ``ValueError`` if it contains none or several of them, or if the shape does not match the values.
     """
 
-    source: Name  #: the application that logged the entry, or a part of it
-    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text that belongs to no series
-    at_ns: TimeNs  #: when it was logged, on the proxy's clock
+    source: Name  #: application that logged the entry, or a component of it
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: name of the series; empty for text without a series
+    at_ns: TimeNs  #: time of the entry, on the proxy's clock
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
-    values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: an array, row by row
-    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: shape of that array
+    values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: array, row by row
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: shape of the array
     severity: Severity = Severity.INFO  #: severity of a text
 
     def __post_init__(self) -> None:
@@ -92,10 +92,10 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
             raise ValueError(f"a log entry of {len(values or ())} values can't have the shape {self.shape!r:.200}")
 
 
-# Results: a processor's output for one frame, and how a processor's workers share the frames.
+# Results: a processor's output for one frame, and the division of frames among a processor's workers.
 
 MAX_PAYLOAD: Final = 32_768  #: maximum size of a packed result [bytes]
-MAX_CODE: Final = 128  #: characters that identify a processor's code
+MAX_CODE: Final = 128  #: maximum length of the text that identifies a processor's code [characters]
 MAX_PARTS: Final = 1024  #: maximum number of parts into which a camera's frames are divided, one per worker
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
@@ -108,11 +108,11 @@ class ProcessorResult(msgspec.Struct, frozen=True, array_like=True):
     camera: Name
     seq: Count  #: number of the frame
     captured_ns: TimeNs  #: capture time of the frame
-    made_ns: TimeNs  #: when the result was ready, on the proxy's clock
-    took_ns: Count  #: how long the worker's ``process`` took [ns]
+    made_ns: TimeNs  #: time at which the result was ready, on the proxy's clock
+    took_ns: Count  #: time that the worker's ``process`` took [ns]
     number: Count  #: increases by one with each result of a worker
     payload: Annotated[bytes, msgspec.Meta(max_length=MAX_PAYLOAD)]  #: see :func:`pack`
-    worker: Count = 0  #: number of the sending application; the proxy overwrites it
+    worker: Count = 0  #: number of the sending application, filled in by the proxy
 
 
 class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
@@ -123,21 +123,21 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
     part: Count  #: number of this worker's part of the frames, from 0
     #: number of parts; 1: every frame; 0: no frames, because the worker reported that it can't take any
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
-    workers: Count  #: number of workers for this processor and camera, including those that are paused
+    workers: Count  #: number of workers for this processor and camera, including paused workers
 
     def __post_init__(self) -> None:
         if self.part >= max(1, self.parts):
             raise ValueError(f"part is {self.part} and must be below parts ({self.parts}), or 0")
 
 
-# A result's value is one MessagePack value. A NumPy array becomes extension type 1, whose bytes are a MessagePack array
-# with the name of its type, its shape and its elements (little-endian, row by row). A dataclass or `msgspec.Struct` is
-# encoded as a map and decoded as a dict.
+# The value of a result is a single MessagePack value. A NumPy array becomes extension type 1, whose bytes are a
+# MessagePack array that contains the name of its type, its shape and its elements (little-endian, row by row). A
+# dataclass or `msgspec.Struct` is encoded as a map and decoded as a dict.
 
-ARRAY: Final = 1  #: the extension type of arrays
+ARRAY: Final = 1  #: extension type of arrays
 MAX_DIMENSIONS: Final = 8
-MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, so that a bounded stack suffices to traverse a value
-#: Allowed element types of arrays: those that are the same on every machine.
+MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, which bounds the stack needed to traverse a value
+#: Allowed element types of arrays; these types are the same on every machine.
 DTYPES: Final = (
     "bool",
     *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
@@ -156,10 +156,10 @@ class _Array(msgspec.Struct, frozen=True, array_like=True):
 
 
 def pack(value: Any) -> bytes:
-    """Encode a result's value. Raises :class:`UsageError` if that is impossible, or it takes more than 32 768 bytes.
+    """Encode a result's value. Raises :class:`UsageError` if it can't be encoded or takes more than 32 768 bytes.
 
-    It may be None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a NumPy
-    array of :data:`DTYPES`, nested at most :data:`MAX_DEPTH` deep.
+    The value may be None, bool, int (64 bits), float, str, bytes, list, tuple, dict, dataclass, ``msgspec.Struct`` or a
+    NumPy array of :data:`DTYPES`, with at most :data:`MAX_DEPTH` levels of nesting.
     """
     try:
         data = _encoder.encode(value)
@@ -189,7 +189,7 @@ def unpack(payload: bytes) -> Any:
 
 
 def _check_depth(value: Any) -> None:
-    """Raise ``ValueError`` for lists and maps nested deeper than :data:`MAX_DEPTH`, without recursion."""
+    """Raise ``ValueError`` if lists and maps are nested deeper than :data:`MAX_DEPTH`; uses no recursion."""
     level = [value]
     for _ in range(MAX_DEPTH + 1):
         inside: list[Any] = []
@@ -250,5 +250,5 @@ def _decode_extension(code: int, data: memoryview) -> Any:
 
 _encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
 _decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
-_plain_decoder = msgspec.msgpack.Decoder()  # does not convert arrays of numbers, which stay bytes
+_plain_decoder = msgspec.msgpack.Decoder()  # doesn't convert arrays of numbers, which remain bytes
 _array_decoder = msgspec.msgpack.Decoder(_Array)

@@ -1,4 +1,4 @@
-"""A drone's state and set-points as rows of numbers, for training data and learned policies."""
+"""Represent a drone's state and set-points as rows of numbers, for training data and learned policies."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from skyloop.messages.command import Attitude, Velocity
 from skyloop.messages.feedback import Feedback
 
 _VELOCITY: Final = ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s")
-#: Names of the numbers in a drone's own state, with the axes and units of :class:`Feedback`.
+#: Names of the numbers in a drone's own state; axes and units are those of :class:`Feedback`.
 STATE: Final = ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m", *_VELOCITY)
-#: Names of the numbers in an application's set-points, by the name of the set-point.
+#: Names of the numbers in each of an application's set-points, by the name of the set-point.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
     "attitude": ("roll", "pitch", "climb", "yaw_rate"),
@@ -20,9 +20,9 @@ ACTIONS: Final[dict[str, tuple[str, ...]]] = {
 
 
 def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
-    """Return the numbers with these names (from :data:`STATE`) in a drone's state; None if any of them is unknown.
+    """Return the named numbers (from :data:`STATE`) of a drone's state; None if any of them is unknown.
 
-    Raises :class:`UnknownNameError` for a name that is not in :data:`STATE`.
+    Raises :class:`UnknownNameError` if a name is not in :data:`STATE`.
     """
     row = []
     for name in names:
@@ -40,7 +40,7 @@ def state_row(feedback: Feedback, names: Sequence[str]) -> list[float] | None:
 
 
 def set_point(kind: str, row: Sequence[float]) -> Velocity | Attitude:
-    """Return the set-point of a kind in :data:`ACTIONS` from its numbers, in the order given there.
+    """Return a set-point of a kind in :data:`ACTIONS`, built from its numbers in the order given there.
 
     Raises :class:`UsageError` if the row has the wrong length.
     """

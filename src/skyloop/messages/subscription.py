@@ -1,6 +1,6 @@
-"""Subscribers' requests: the rate of feedback; the camera, encoding and rate of video. Pure.
+"""Define subscribers' requests: the rate of feedback, and the camera, encoding and rate of video. Pure.
 
-Each request has exactly one topic, so equal requests are encoded once for all their subscribers.
+Each request has exactly one topic; equal requests are therefore encoded once for all their subscribers.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from skyloop.errors import UsageError
 from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
-MIN_HZ: Final = 0.001  #: lowest rate, one sample every quarter of an hour, which keeps the period finite
+MIN_HZ: Final = 0.001  #: lowest rate: one sample every quarter of an hour, which keeps the period finite
 MAX_HZ: Final = 1000.0
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
-TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may be too early
+TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may arrive early
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
-MIN_KBIT_S: Final = 30  #: lowest rate of a stream that the proxy encodes
+MIN_KBIT_S: Final = 30  #: lowest bit rate of a stream that the proxy encodes
 MAX_KBIT_S: Final = 50_000
-MAX_SUBSCRIBER: Final = 32  #: characters in a subscriber's name
-MIN_FPS: Final = 0.001  #: lowest rate, one frame every quarter of an hour, which keeps the period finite
+MAX_SUBSCRIBER: Final = 32  #: maximum length of a subscriber's name [characters]
+MIN_FPS: Final = 0.001  #: lowest rate: one frame every quarter of an hour, which keeps the period finite
 _ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
 _STREAM_PREFIX: Final = "stream/"
@@ -35,12 +35,12 @@ _FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "
 
 @dataclass(frozen=True, slots=True)
 class FeedbackRequest:
-    """One consumer's request for feedback. Requests for the same samples are equal and have the same :attr:`topic`.
+    """A consumer's request for feedback. Requests for the same samples are equal and have the same :attr:`topic`.
 
-    Raises :class:`UsageError` if ``max_hz`` is not between :data:`MIN_HZ` and :data:`MAX_HZ`.
+    Raises :class:`UsageError` if ``max_hz`` is not within :data:`MIN_HZ` to :data:`MAX_HZ`.
     """
 
-    max_hz: float | None = None  #: maximum number of samples a second; None: all
+    max_hz: float | None = None  #: maximum number of samples per second; None: no limit
 
     def __post_init__(self) -> None:
         rate = self.max_hz
@@ -48,17 +48,17 @@ class FeedbackRequest:
             known = isinstance(rate, int | float) and not isinstance(rate, bool)
             if not (known and MIN_HZ <= rate <= MAX_HZ):
                 raise UsageError(f"max_hz is {rate!r} and must be from {MIN_HZ} to {MAX_HZ:g} samples a second")
-            # Round the rate as in the topic's name, so that both ends have the same request.
+            # Round the rate as in the topic's name so that subscriber and publisher have the same request.
             object.__setattr__(self, "max_hz", float(f"{rate:g}"))
 
     @property
     def is_plain(self) -> bool:
-        """Whether it includes every sample."""
+        """Whether the request includes every sample."""
         return self.max_hz is None
 
     @property
     def topic(self) -> str:
-        """The topic to subscribe to: ``feedback`` or, if the rate is limited, for example ``feedback?max_hz=5``."""
+        """The topic to subscribe to: ``feedback``, or for example ``feedback?max_hz=5`` if the rate is limited."""
         return FEEDBACK if self.max_hz is None else f"{_FEEDBACK_RATE}{self.max_hz:g}"
 
     @property
@@ -68,9 +68,9 @@ class FeedbackRequest:
 
     @classmethod
     def parse(cls, topic: str) -> Self:
-        """Parse a topic, which must have exactly the form of :attr:`topic`; raise :class:`UsageError` otherwise.
+        """Parse a topic in exactly the form of :attr:`topic`; raise :class:`UsageError` for any other form.
 
-        This way each request has only one topic, and is encoded once.
+        In this way, each request has only one topic and is encoded once.
         """
         if topic == FEEDBACK:
             return cls()
@@ -85,7 +85,7 @@ class FeedbackRequest:
         return request
 
     def union(self, other: FeedbackRequest) -> FeedbackRequest:
-        """Return the smallest request that includes both."""
+        """Return the smallest request that includes both requests."""
         if self.max_hz is None or other.max_hz is None:
             return PLAIN
         return self if self.max_hz >= other.max_hz else other
@@ -96,20 +96,20 @@ PLAIN: Final = FeedbackRequest()
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """One consumer's request for a camera's frames; H.264 streams have a separate topic, :attr:`stream_topic`.
+    """A consumer's request for a camera's frames; an H.264 stream has its own topic, :attr:`stream_topic`.
 
     Requests for the same frames are equal and have the same :attr:`topic`. Raises :class:`UsageError` for invalid
     values.
     """
 
     camera: str
-    encoding: VideoEncoding = "raw"  #: encoding of the pixels if they must be sent: unchanged, JPEG or H.264
+    encoding: VideoEncoding = "raw"  #: encoding of the pixels when sent over a network: unchanged, JPEG or H.264
     quality: int = DEFAULT_QUALITY  #: JPEG quality, 1 to 100
-    max_fps: float | None = None  #: maximum number of frames a second; None: all
+    max_fps: float | None = None  #: maximum number of frames per second; None: no limit
     scale: float = 1.0  #: factor for width and height, greater than 0 and at most 1
-    part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n is k
-    kbit_s: int | None = None  #: average H.264 rate; None: as sent by the vehicle, or as much as the path can carry
-    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate is adapted to the path to it
+    part: tuple[int, int] | None = None  #: (k, n): only frames whose number modulo n equals k
+    kbit_s: int | None = None  #: average H.264 bit rate; None: as sent by the vehicle, or as much as the path can carry
+    subscriber: str = ""  #: unique name of the only subscriber, if the H.264 rate adapts to that subscriber's path
 
     def __post_init__(self) -> None:
         if not self.camera:
@@ -128,7 +128,7 @@ class VideoRequest:
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         self._check_stream()
         if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # unused; the same in all equivalent requests
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # not used: the same in all equivalent requests
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
@@ -150,7 +150,7 @@ class VideoRequest:
 
     @property
     def variant(self) -> str:
-        """The part after the ``?`` of the topic; empty for unchanged frames."""
+        """The part of the topic after the ``?``; empty for unchanged frames."""
         return self._variant("" if self.encoding == "raw" else self.encoding)
 
     def _variant(self, encoding: str) -> str:
@@ -182,7 +182,7 @@ class VideoRequest:
 
     @property
     def plain(self) -> VideoRequest:
-        """The request for all frames of the same camera, unchanged."""
+        """A request for all frames of the same camera, unchanged."""
         return VideoRequest(self.camera)
 
     @classmethod
@@ -202,9 +202,9 @@ class VideoRequest:
 
 
 class FrameFilter:
-    """Selects the frames for a request (``part``, ``max_fps``) from those of one camera, by number and capture time.
+    """Selects a request's frames (``part``, ``max_fps``) from those of one camera, by number and capture time.
 
-    It keeps state, so each stream of frames needs its own.
+    A filter has state, and each stream of frames needs its own.
     """
 
     def __init__(self, request: VideoRequest) -> None:
@@ -212,9 +212,9 @@ class FrameFilter:
         self._rate = RateLimiter(request.max_fps)
 
     def wants(self, seq: int, captured_ns: int) -> bool:
-        """Return whether the request includes this frame. Call it once for each frame, in order.
+        """Return whether the request includes this frame. Must be called once for each frame, in order.
 
-        The capture time [ns] may be on any clock as long as it is always the same.
+        The capture time [ns] may be on any clock, but always on the same one.
         """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
@@ -222,19 +222,19 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Thins a series of samples to an average rate.
+    """Reduces a series of samples to an average rate.
 
-    It keeps state, so each series and each consumer needs its own.
+    A limiter has state, and each series and each consumer needs its own.
     """
 
     def __init__(self, max_hz: float | None) -> None:
-        """Create a limiter, which keeps the first sample to arrive. None: keep all samples."""
+        """Create a limiter. It keeps the first sample that arrives. None: keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
     @property
     def max_hz(self) -> float:
-        """Maximum rate; infinity: keep all samples."""
+        """Maximum rate; infinity: all samples are kept."""
         return NS_PER_S / self._period_ns if self._period_ns else math.inf
 
     @max_hz.setter
@@ -242,14 +242,14 @@ class RateLimiter:
         self._period_ns = round(NS_PER_S / max_hz)  # 0: keep every sample
 
     def in_time(self, at_ns: int) -> bool:
-        """Return whether to keep a sample. Call it once for each sample, in order.
+        """Return whether to keep a sample. Must be called once for each sample, in order.
 
-        Its time [ns] may be on any clock, but must always be on the same one.
+        The sample's time [ns] may be on any clock, but always on the same one.
         """
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
             return True
-        # A time long before the last one means that the source has been restarted: start over.
+        # A time long before the previous one means that the source was restarted: start over.
         if due_ns is None or at_ns < due_ns - 2 * period_ns or at_ns >= due_ns + period_ns:
             self._due_ns = at_ns + period_ns
             return True
