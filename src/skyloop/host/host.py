@@ -62,7 +62,7 @@ class Host:
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
         self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
-        self._reactor = Reactor()  # the reactor for vehicles that are added
+        self._reactor = Reactor()  # the reactor for vehicles that are added later
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -215,8 +215,8 @@ class Host:
     ) -> None:
         """End all flights (landing for up to ``within_s`` [s]), proxies, and threads that are not stuck. Idempotent.
 
-        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
-        does Ctrl-C if nothing else handles it; ``KeyboardInterrupt`` is then raised at the end.
+        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings.
+        Ctrl-C does the same if nothing else handles it. ``KeyboardInterrupt`` is then raised at the end.
         """
         with self._lock:
             self._closing = True
@@ -252,7 +252,7 @@ class Host:
         return None
 
     def _on_stall(self, loop: SharedLoop, member: Any) -> None:
-        """Move all other vehicles from a stalled loop to a new one."""
+        """Move all other vehicles from a stalled loop to a new loop."""
         with self._lock:
             new: SharedLoop
             if not self._is_shared(loop):
@@ -296,7 +296,7 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle from the host's file that is not running."""
+    """Return the settings of a vehicle in the host's file that is not running."""
     settings = host.known.get(name)
     if settings is None:
         raise UnknownNameError("vehicle of this host's file", name, host.known)

@@ -30,10 +30,10 @@ from skyloop.transport.local import LocalServer
 STARTS_WITHIN_S: Final = 20.0  #: time limit for the first report
 FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; doubles each time the process dies
 LONGEST_PAUSE_S: Final = 30.0  #: maximum length of that pause
-#: Checks without a report, at four per second, after which the process is considered hung and killed. Checks are
-#: counted rather than seconds, so that a process is not considered hung after its computer was suspended.
+#: Checks without a report, at four per second, after which the process is considered hung and killed. The watchdog
+#: counts checks rather than seconds, so that a process is not considered hung after its computer was suspended.
 SILENT_CHECKS: Final = 40
-STARTING_CHECKS: Final = 80  #: the same limit before the process has sent its first report
+STARTING_CHECKS: Final = 80  #: the same limit for the time before the process has sent its first report
 STEADY_S: Final = 60.0  #: if it ran for this long before it died, a process is restarted after the shortest pause
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
@@ -94,7 +94,7 @@ class OwnProcessVehicle(HostedVehicle):
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)
-            except msgspec.DecodeError:  # a line printed by a driver
+            except msgspec.DecodeError:  # a line that a driver printed
                 _log.info("%s: %s", self.settings.name, line.decode(errors="replace").rstrip())
                 continue
             with self._changed:

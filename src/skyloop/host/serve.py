@@ -39,7 +39,7 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-_POLL_S: Final = 0.2  # interval between checks for signals and changes
+_POLL_S: Final = 0.2  # interval between checks for signals and updates
 MAX_REQUEST: Final = 1 << 22  #: maximum size in bytes, sent in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: maximum size in bytes
 MAX_ANSWER: Final = 1 << 22  #: maximum size in bytes
@@ -56,8 +56,8 @@ def serve(
     """Serve all vehicles of a fleet that start automatically. Blocks. Must run on the main thread.
 
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
-    …`` after all have been tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
-    ``land_within_s`` [s]; a second signal ends the wait. Members of ``group`` may also add and remove vehicles.
+    …`` after all have been tried. SIGINT or SIGTERM ends it. It first lands all flying vehicles, for up to
+    ``land_within_s`` [s]. A second signal ends this wait. Members of ``group`` may also add and remove vehicles.
     ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
@@ -153,7 +153,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
     """Return a source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # a folder whose vehicle could not be served
+        with suppress(UsageError, ImportError):  # a vehicle whose key folder can't be used is not served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
@@ -195,7 +195,7 @@ Request = Status | Add | AddNamed | Remove
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """The host's answer."""
+    """The answer from a host."""
 
     vehicles: tuple[VehicleStatus, ...] = ()  #: all vehicles, or those in the request
     problems: dict[str, str] = {}  #: why vehicles could not be added, by name
@@ -214,7 +214,7 @@ _ERRORS: Final[dict[str, type[SkyloopError]]] = {
 
 
 class ControlServer:
-    """Accepts requests from this user and the members of a group, from :meth:`start` to :meth:`stop`."""
+    """Between :meth:`start` and :meth:`stop`, accepts requests from this user and from the members of a group."""
 
     def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
         self._name = name
@@ -268,7 +268,7 @@ class ControlServer:
         sock.hang_up()
 
     def _answer(self, sock: Socket) -> Answer | None:
-        """Return the answer to a request, or None if there was no request because a client only checked for a host."""
+        """Return the answer to a request; None if a client only checked whether a host exists."""
         if not may_connect(sock, self._directory.gid):
             return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
@@ -278,7 +278,7 @@ class ControlServer:
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)
-                break  # the request filled its last packet exactly
+                break  # the request exactly filled the last packet
         if not received:
             return None
         if len(received) > MAX_REQUEST:
@@ -299,7 +299,7 @@ class ControlServer:
 
 
 def _send(sock: Socket, text: bytes) -> None:
-    """Send a request or an answer in as many packets as needed."""
+    """Send a request or an answer, split into as many packets as needed."""
     for first in range(0, len(text), _CHUNK):
         sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
 

@@ -20,13 +20,13 @@ from skyloop.drivers.vehicle_link import PAUSE_S
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
-#: Failed ticks in succession (half a second) after which a proxy counts as failed: it no longer has a failsafe.
+#: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
 #: Number of rounds after which a proxy does everything again, ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing; must return immediately.
+#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing. It must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
 MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
 IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
@@ -51,8 +51,8 @@ class Ticker:
         self.inside: Proxy | None = None  #: the proxy currently being ticked
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
-        self._failures = dict.fromkeys(proxies, 0)  # number of failures in succession, by proxy
-        self._lock = threading.Lock()  # guards what is known about whose code is running
+        self._failures = dict.fromkeys(proxies, 0)  # number of failures in a row, by proxy
+        self._lock = threading.Lock()  # guards the record of whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -183,7 +183,7 @@ class PooledJobQueue:
         self._stopped = False
 
     def start(self) -> None:
-        """Do nothing: the pool has its threads."""
+        """Do nothing, because the pool has its own threads."""
 
     def put(self, job: Job) -> None:
         """Queue a job. Any thread."""
@@ -219,7 +219,7 @@ class PooledJobQueue:
 
 
 class SharedLoop(Protocol):
-    """A thread that runs many vehicles' code: a ``Reactor`` or a ``Ticker``."""
+    """A thread that runs the code of many vehicles: a ``Reactor`` or a ``Ticker``."""
 
     @property
     def inside(self) -> Any:
@@ -240,9 +240,9 @@ class SharedLoop(Protocol):
 class Watchdog:
     """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
-    It counts its own checks rather than time, so that a loop on a suspended or overloaded machine is not considered
+    It counts its own checks rather than time. A loop on a suspended or overloaded machine is therefore not considered
     hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for each call
-    that does not return, and ``on_hang`` if the call still has not returned.
+    that does not return. ``on_hang`` is called if that call still does not return.
     """
 
     def __init__(
@@ -297,11 +297,11 @@ class LinkThread:
 
     One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
     it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
-    shows whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
+    records whose code is running and can be split. ``links``: the initial links, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
-        self.inside: Any = None  #: the vehicle whose link is currently being served
+        self.inside: Any = None  #: the vehicle whose link is currently being polled
         self.entries = 0  #: number of times :attr:`inside` was set
         self._selector = selectors.DefaultSelector()
         self._waker, self._awake = socket.socketpair()
@@ -334,7 +334,7 @@ class LinkThread:
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:
-        """Leave this thread to one vehicle's links; return a new one for all other links. Any thread."""
+        """Leave this thread to one vehicle's links, and return a new thread for all other links. Any thread."""
         with self._lock:
             others = {link: vehicle for link, vehicle in self._members.items() if vehicle is not stuck}
             for link in others:
@@ -342,7 +342,7 @@ class LinkThread:
         return LinkThread(others)
 
     def close(self) -> None:
-        """End the thread, unless it is stuck, and any links that remain. Idempotent."""
+        """End the thread unless it is stuck, and end the links that remain. Idempotent."""
         self._closing = True
         self._wake()
         if threading.current_thread() is not self._thread and self.inside is None:
@@ -404,7 +404,7 @@ class LinkThread:
             self.inside = None
         with self._lock:
             left = list(self._members)
-        for link in left:  # links of a vehicle that was dropped
+        for link in left:  # the links of a vehicle that was dropped
             link.end()
         self._selector.close()
         self._awake.close()

@@ -46,7 +46,7 @@ class Condition(StrEnum):
 
 
 class VehicleStatus(msgspec.Struct, frozen=True):
-    """One row in ``skyloop host status``."""
+    """One row in the output of ``skyloop host status``."""
 
     name: str
     address: str
@@ -241,7 +241,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 
 def within(call: Callable[[], object], seconds: float) -> bool:
-    """Run something that may hang on a separate thread, and raise its exceptions here.
+    """Run a function that may hang on a separate thread, and raise its exceptions on this one.
 
     Returns whether the call returned in time. Otherwise, the daemon thread keeps running.
     """

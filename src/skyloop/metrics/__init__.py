@@ -1,6 +1,6 @@
-"""Metrics of proxies, the cockpit and routers for Prometheus, collected only when scraped, never on a sample's path.
+"""Metrics of proxies, the cockpit and routers for Prometheus, collected only when they are scraped.
 
-They can be read on any thread, without taking any lock that a command waits for. Needs the extra ``metrics``.
+They can be read on any thread, without taking any lock that a command waits for. Requires the ``metrics`` extra.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported as 0,
-#: except those of a network that is not served.
+#: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported
+#: as 0, except those of a network that is not served.
 _COUNTERS: Final = (
     *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
     *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
@@ -103,7 +103,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
     for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
-            continue  # pages open any number of video streams, and an observer sends no commands
+            continue  # pages open any number of video streams, while an observer sends no commands
         labels = (name, channel)
         yield Reading("skyloop_client_received_total", float(stats.count), labels)
         yield Reading("skyloop_client_lost_total", float(stats.lost), labels)

@@ -134,22 +134,22 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: simultaneous scrapes; one more closes the connection that has waited longest for its request
+MAX_SCRAPES: Final = 8  #: maximum number of open scrapes; one more closes the one that has waited longest
 ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop
 _log = logging.getLogger(__name__)
 
-#: Reads the current values of one source.
+#: Reads the current metrics of one source.
 Source = Callable[[], Iterable[Reading]]
 
 
 def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: float = DEADLINE_S) -> Endpoint:
     """Serve metrics over HTTP until the endpoint is closed.
 
-    ``sources`` and each source are called on the endpoint's threads for each scrape. ``where``: ``[HOST:]PORT``; the
-    host defaults to 127.0.0.1, and port 0 picks a free one. ``deadline_s``: maximum duration of a connection [s]; at
-    most :data:`MAX_SCRAPES` are open at a time.
+    ``sources`` is called on the endpoint's threads for each scrape, and so is each source. ``where``: ``[HOST:]PORT``.
+    The host defaults to 127.0.0.1, and port 0 picks a free port. ``deadline_s``: maximum duration of a connection [s].
+    At most :data:`MAX_SCRAPES` connections are open at a time.
     """
     return Endpoint(sources, parse_where(where), deadline_s)
 
@@ -163,7 +163,7 @@ def parse_where(where: str) -> tuple[str, int]:
 
 
 class Endpoint(AbstractContextManager["Endpoint"]):
-    """Serves metrics over HTTP. Created by :func:`serve`; a context manager that closes it."""
+    """Serves metrics over HTTP. Created by :func:`serve`. The context manager closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
         """Start listening and answering; see :func:`serve`."""

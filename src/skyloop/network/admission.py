@@ -1,6 +1,6 @@
 """Admit applications that prove their identity with their keys, as long as there is room for them.
 
-When they exchange these proofs, the two ends also agree on the keys that seal their packets.
+The exchange of these proofs also gives the two ends the keys that seal their packets.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
 #: Connections allowed per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
-#: Connections reserved for keys that may fly this drone, so that other keys, however many, can't lock pilots out.
+#: Connections reserved for keys that may fly this drone, so that any number of other keys can't lock pilots out.
 FOR_PILOTS: Final = 64
-#: Tokens remembered per key, because a token arrives before its connection.
+#: Number of tokens remembered per key, because a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
 #: Total limit without keys: all applications then have the same name, and a flood looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 
 class Admission(NamedTuple):
-    """The terms of a connection; without keys, only ``welcome`` is set."""
+    """The terms of a connection. Without keys, only ``welcome`` is set."""
 
     welcome: bytes = b""  #: the proxy's answer
     offer: bytes = b""  #: the proof contained in the request
@@ -124,7 +124,7 @@ def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]
 
 
 class Tokens:
-    """The liveliness tokens of connections, limited per identity or, without keys, in total. Not thread-safe."""
+    """The liveliness tokens of connections, with a limit per identity or, without keys, in total. Not thread-safe."""
 
     def __init__(self, *, by_key: bool) -> None:
         self._most = TOKENS_PER_KEY if by_key else TOKENS

@@ -1,4 +1,4 @@
-"""The application's end of the fabric transport, and the topics to which it has subscribed."""
+"""The application's end of the fabric transport, and the topics that it has subscribed to."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity
 
-GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
+GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues with another session
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
 #: ended before they were re-established: it then mistakes the new links for additional ones and announces nothing on
 #: them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
-STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
+STALLED_S: Final = 5.0  #: after this time without an acknowledgement, a proxy is considered gone
 KEYS_S: Final = 0.5  #: interval between checks for a newer roster
 FAREWELL_S: Final = 0.3  #: time to wait for an answer to a bye
 _VIDEO: Final = video("")
@@ -180,7 +180,7 @@ class Subscription:
             self._enqueue(self, packet, number)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        """Queue a frame, replacing one that is already queued."""
+        """Queue a frame. It replaces a frame that is already queued."""
         opener = self._opener
         try:
             attachment = packets.copied(sample.attachment, packets.MAX_OWN)
@@ -201,7 +201,7 @@ class Subscription:
             self._enqueue(self, b"", number)
 
 
-#: Items for the receiving thread: a packet of a topic (None: sent to this end only; empty: a frame), its number.
+#: Items for the receiving thread: a topic (None: sent to this end only), its packet (empty: a frame), its number.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
@@ -234,14 +234,14 @@ class FabricClient(TransportClient):
         self._run = ""  # the proxy's run, set once a proxy has been asked to admit us
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each with its declarations
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each subscription with its declarations
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None
         self._report_key = layout.upward(layout.ASK, name, self._who, self._id)
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
-        self._keys_s = 0.0  # when to check the keys next
+        self._keys_s = 0.0  # time of the next check of the keys
         self._admission = Admission()  # with keys: the proxy's identity, and seals for the packets
         self.forged = 0  #: number of packets and frames that did not come from the proxy
         self._receiver = Receiver()  # packets for this end only
@@ -278,7 +278,7 @@ class FabricClient(TransportClient):
             else:
                 return about
 
-    # --- calls of the application ---
+    # --- calls by the application ---
 
     def send(self, packet: bytes) -> bool:
         if not 0 < len(packet) <= MAX_PACKET:
@@ -389,7 +389,7 @@ class FabricClient(TransportClient):
             self._end("the proxy is gone")
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet sent to this application only."""
+        """Handle a packet that was sent only to this application."""
         try:
             opened = contents(self._admission.opener, sample)
             if opened is None:
@@ -436,7 +436,7 @@ class FabricClient(TransportClient):
         self._inbox.put((subscription, packet, number))
 
     def _reject(self, error: DecodeError) -> None:
-        """Count a sample that did not come from the proxy; log the first one."""
+        """Count a sample that did not come from the proxy, and log the first such sample."""
         self.forged += 1
         if self.forged == 1:
             _log.warning("%s: ignored a packet that the proxy did not send: %s", self._name, error)
@@ -474,7 +474,7 @@ class FabricClient(TransportClient):
             if self._ended:
                 return
             self._reason = self._reason or reason
-            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # sent after everything that was sent before
+            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # sent after all previous packets
                 self._put(layout.ASK, packets.bye(reason), 0)
             self._ended = True
         self._inbox.put(None)
@@ -488,7 +488,7 @@ class FabricClient(TransportClient):
         held += [publisher for publisher in (self._command, self._report) if publisher is not None]
         undeclare(held)
 
-    # --- the receiving thread ---
+    # --- on the receiving thread ---
 
     def _receive(self) -> None:
         while (item := self._next()) is not None:
@@ -545,7 +545,7 @@ class FabricClient(TransportClient):
 
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
+    """Return the reply to a request that an application's keys don't allow. Such a request does not reach the proxy.
 
     None if the packet is not a request.
     """

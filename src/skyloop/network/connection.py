@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import zenoh
 
 #: Maximum number of one application's packets, and of its commands, that wait for the handler. Further packets are not
-#: acknowledged and are therefore resent; further commands are dropped: newer ones follow. Set-points count as one.
+#: acknowledged and are therefore resent. Further commands are dropped, as newer ones follow. Set-points count as one.
 MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
 _OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are requested again
@@ -46,8 +46,8 @@ class ServerConnection:
         self.id = connection
         self.admission = admission
         self.joined_s = joined_s  #: when the application asked to join
-        self.commands = PacketBacklog(MAX_WAITING)  #: commands waiting for the handler; guarded by the server
-        self.announced = False  #: the handler knows the application
+        self.commands = PacketBacklog(MAX_WAITING)  #: commands that wait for the handler; the server guards this list
+        self.announced = False  #: the handler was told about the application
         self.confirmed = False  #: its token has been seen, so Zenoh will report its end
         self.ended = False  #: further packets from the application are ignored
         self.reason = ""  #: why the connection ends, once either end has given a reason
@@ -72,7 +72,7 @@ class ServerConnection:
     def took(self, topic: str, number: int, now_s: float) -> bool:
         """Record up to which packet the application has acknowledged a topic, or (if empty) packets to it alone.
 
-        Returns whether further packets that go only to this application may be due.
+        Returns whether more packets that go only to this application may be waiting.
         """
         with self.lock:
             if not topic:
@@ -92,7 +92,7 @@ class ServerConnection:
         return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, are unacknowledged"
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long nothing has been acknowledged [s]; 0 if no packet is unacknowledged."""
+        """Return for how long nothing has been acknowledged [s]; 0 if no packet is waiting for an acknowledgement."""
         with self.lock:
             return self.outgoing.stalled_s(now_s)
 
@@ -113,7 +113,7 @@ class ServerConnection:
             if self._taken:
                 found.insert(0, (0, packets.taken("", self._taken)))
                 self._taken = 0
-            found += [(0, packet) for packet in self._own]  # a bye is sent last
+            found += [(0, packet) for packet in self._own]  # a bye is always the last packet
             self._own.clear()
             return found, self.outgoing.under_way and not self.ended
 
@@ -176,7 +176,7 @@ class Sender:
 
 
 class Publisher:
-    """Keeps the subscriptions of all connections and publishes to them. Thread-safe."""
+    """Stores the subscriptions of all connections, and publishes to the subscribers. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
@@ -208,7 +208,7 @@ class Publisher:
             self._publishers.clear()
 
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to all subscribers of a topic; return how many are too far behind to receive it.
+        """Send a packet to all subscribers of a topic; return how many subscribers are too far behind to receive it.
 
         On a topic where only the newest packet counts, most packets are skipped while the paths to all subscribers are
         stalled.
@@ -234,7 +234,7 @@ class Publisher:
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
-            else:  # the topic was named by an application: leave no declaration behind
+            else:  # an application chose the topic's name: leave no declaration behind
                 session.put(key, payload, attachment, "DATA")
         except load().ZError:
             return len(subscribed)  # stopping
@@ -293,7 +293,7 @@ class Publisher:
             self._subscribed.pop(topic, None)
             if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # freed once its last user drops it
+                self._publishers.pop(topic, None)  # freed when its last user releases it
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         newest_wins = layout.newest_wins(topic)

@@ -1,10 +1,10 @@
 """Deliver numbered packets exactly once and in order, even if some are lost on the way.
 
-The number of packets in flight is bounded. Time is passed as an argument, and the callers do the sending.
+The number of packets in flight is bounded. Time is passed as an argument, and sending is left to the callers.
 
 Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router; it also drops
 packets that reach a node before the subscription does. Each numbered packet is therefore kept and resent until the
-other end acknowledges it. Only a few are in flight at once, to avoid congesting a slow path.
+other end acknowledges it. Only a few frames are in flight at once, to avoid congesting a slow path.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Final
 
 from skyloop.network import packets
 
-DEPTH: Final = 256  #: number of unacknowledged packets to one end before further ones are refused
+DEPTH: Final = 256  #: maximum number of unacknowledged packets to one end; further packets are refused
 MAX_BYTES: Final = 1 << 20  #: size of unacknowledged packets to one end before further ones are refused [bytes]
-RECENT_PACKETS: Final = 64  #: number of latest packets remembered to detect repeats
+RECENT_PACKETS: Final = 64  #: number of recent packets that are remembered to detect repeats
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets …
-#: Number of packets in flight: as many as Zenoh queues per link before it drops one (config._QUEUES).
+#: Number of packets in flight. Zenoh queues as many per link before it drops one (``config._QUEUES``).
 ON_THE_WAY: Final = 16
 ON_THE_WAY_BYTES: Final = 1 << 18  #: total size of packets in flight [bytes]
 ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and at this interval where only the newest packet counts (:class:`Pace`)
@@ -109,7 +109,7 @@ class Outgoing:
         return self._under_way > 0
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long the other end has acknowledged nothing [s]; 0 if no packet is in flight."""
+        """Return for how long the other end has acknowledged nothing [s]; 0 if all packets are acknowledged."""
         return now_s - self._headway_s if self._under_way else 0.0
 
 
@@ -121,7 +121,7 @@ class Incoming:
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
-        """Return the packets that can be delivered now that this one arrived, in order; none if it is a repeat."""
+        """Return the packets that can now be delivered in order, including this one; none if this one is a repeat."""
         if number != self.taken + 1:
             if self.taken < number <= self.taken + ON_THE_WAY:
                 self._early.setdefault(number, packet)
@@ -166,7 +166,7 @@ class Pace:
 
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
-        self._eager = False  # the other end acknowledges more often than required, so its silence is significant
+        self._eager = False  # the other end acknowledges more often than it must, so silence means a loss
         self._sent_s = -math.inf  # when the newest packet was sent
         self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
@@ -204,7 +204,7 @@ class RecentPackets:
 
 
 class Receiver:
-    """Receives packets at one end of a connection: numbered ones exactly once and in order, all others at most once.
+    """Receives packets at one end of a connection: numbered packets exactly once and in order, all others at most once.
 
     The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
     other packets are passed to ``deliver``. Thread-safe; numbered packets are passed on by one thread at a time.

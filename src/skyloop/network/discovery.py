@@ -1,8 +1,8 @@
 """Discovery: list the network's proxies, find one that comes back, and join one.
 
-Zenoh retries the addresses it was given, but searches by multicast only after 1, 2, 4 and then every 8 seconds. An
-application that misses a proxy therefore searches here, without a connection. If a node answers that the current
-session does not know, the application opens a new session, which finds that node within milliseconds.
+Zenoh retries the addresses that it was given, but repeats its multicast search only after 1, 2, 4 and then every 8
+seconds. An application that does not find a proxy therefore searches here, without a connection. If a node answers that
+the current session does not know about, the application opens a new session, which finds that node within milliseconds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     import zenoh
 
-#: Time for a newly opened session to find all nodes within reach, either by multicast or at the given addresses.
+#: Time that a newly opened session needs to find all nodes within reach, by multicast or at the given addresses.
 SETTLE_S: Final = 0.6
 ANSWER_S: Final = 0.5  #: time for proxies to send their descriptions
 #: Time for a linked node to list the tokens that it knows: normally milliseconds, unless it is flooded with tokens.
@@ -42,22 +42,22 @@ FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retr
 _POLL_S: Final = 0.05
 JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
-MAX_CANDIDATES: Final = 4  #: with keys: how many proxies with the same name to ask until one proves its identity
+MAX_CANDIDATES: Final = 4  #: with keys: maximum number of proxies of this name to ask until one proves its identity
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
-    """List the proxies that this process can reach over the network, by name and age. Takes about a second."""
+    """List the proxies that this process can reach over the network, sorted by name and age. Takes about a second."""
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
-        runs(session)  # once this is answered, all reachable nodes are known
+        runs(session)  # once the host has answered this request, all reachable nodes are known
         return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
     finally:
         release(session)
 
 
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, oldest first. There are several only if a network was split."""
+    """Return the proxies with this name, oldest first. There are several only if a network was temporarily split."""
     if not settings.multicast and not settings.connect:
         return []  # others would have to connect to us, but we don't listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
@@ -77,7 +77,7 @@ def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
     """Return NAME and RUN of the transport servers whose tokens are currently visible.
 
-    This takes as long as the linked nodes need to send their tokens, but at most :data:`SYNC_S`.
+    This takes as long as the linked nodes need to send their tokens, but no more than :data:`SYNC_S`.
     """
     return listed(session, name)[0]
 
@@ -137,7 +137,7 @@ class UnreachablePeers:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether an answer came from an unknown peer for which no session has been opened yet."""
+        """Return whether an unknown peer answered for which no session has been opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)
@@ -159,7 +159,7 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know. If there are any, retire the session and return True."""
+    """Search for nodes that a session does not know about. If there are any, retire the session and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -189,10 +189,10 @@ def _search(session: Session) -> set[str]:
 
 
 class ProxyWatch:
-    """Monitors which transport servers with one name are alive.
+    """Monitors which transport servers with a given name are alive.
 
-    ``on_gone``: called on one of Zenoh's threads with the run of a proxy that disappears. ``known``: the description of
-    a proxy with this name, if received earlier; it is not requested again.
+    ``on_gone`` is called on one of Zenoh's threads with the run of each proxy that disappears. ``known``: the
+    description of a proxy with this name, if it was received earlier. It is then not requested again.
     """
 
     def __init__(
@@ -214,8 +214,8 @@ class ProxyWatch:
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
         """Wait for a proxy with this name, then up to ``list_s`` [s] for linked nodes to list theirs.
 
-        Returns each candidate's run and description, best first. The best is the oldest; with keys the others follow,
-        because the oldest may have no key for this name. Raises :class:`UnknownNameError` if there is none, and
+        Returns each candidate's run and description, best first. The best one is the oldest. With keys, the others
+        follow, because the oldest may have no key for this name. Raises :class:`UnknownNameError` if there is none, and
         :class:`NoAnswerError` if one was found but has disappeared, or a linked node does not list its tokens.
         """
         with self._changed:

@@ -32,7 +32,7 @@ MAX_FORMS_EACH: Final = 8  #: number of formats that one connection may read
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
-#: Sends one encoded frame of a variant, either to all its readers or to the given connections.
+#: Sends one encoded frame of a variant, either to all readers of the variant or only to the given connections.
 Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
 
 
@@ -73,7 +73,7 @@ class Reader:
         self.due = self.waits = False
 
     def taken(self, number: int) -> None:
-        """Record that the frames up to this number were received."""
+        """Record that all frames up to this number were received."""
         while self._on_way and self._on_way[0][0] <= number:
             self._on_way.popleft()
 
@@ -141,7 +141,7 @@ class FramePublisher:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send frames to a connection, starting with the next one. Return False if that fails (see :meth:`problem`)."""
+        """Send frames to a connection from the next frame on. Return False if that fails (see :meth:`problem`)."""
         with self._changed:
             if self._problem(key, topic):
                 return False
@@ -266,7 +266,7 @@ class FramePublisher:
         return None
 
     def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
-        """Encode a frame as requested; if that fails, return it unencoded and log the failure once."""
+        """Encode a frame as requested. If that fails, return the frame unencoded and log the failure once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)
         except (MissingExtraError, LinkError) as error:

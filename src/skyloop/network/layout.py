@@ -2,9 +2,9 @@
 
 A packet that requests something must travel by the matching key, so controlling keys means controlling actions.
 
-``docs/wire-format.md`` has the table. NAME is a proxy's name, WHO an application's identity (the common name of its
-certificate, ``anyone`` without keys), ID a connection (16 random hexadecimal digits). TOPIC, CAMERA and VARIANT may be
-arbitrary text, so each is percent-encoded to one chunk of a key.
+``docs/wire-format.md`` contains the table. NAME is a proxy's name. WHO is an application's identity: the common name of
+its certificate, or ``anyone`` without keys. ID is a connection (16 random hexadecimal digits). TOPIC, CAMERA and
+VARIANT may be arbitrary text, so each is percent-encoded to one chunk of a key.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ WAYS: Final = (ASK, ORDER, COMMAND)
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, because garbage must stay in order
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, so that garbage keeps its place in the order
 _POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need these to fly
 
 
@@ -100,7 +100,7 @@ def topic(name: str, topic_name: str) -> str:
 
 
 def newest_wins(topic_name: str) -> bool:
-    """Return whether only a topic's newest packet counts, so that it may be lost and never waits for earlier ones."""
+    """Return whether only a topic's newest packet matters. It may then be lost, and never waits for earlier ones."""
     return topic_name.partition("?")[0] == FEEDBACK  # feedback in any variant
 
 
@@ -136,12 +136,12 @@ def parse_alive(key: str) -> tuple[str, str]:
 
 
 def parse_topic(key: str) -> str:
-    """Return the topic from a key made by :func:`topic`."""
+    """Return the topic for which :func:`topic` made a key."""
     return unquote(key.rpartition("/")[2])
 
 
 def check_identity(who: str) -> None:
-    """Check that an identity can be used as WHO."""
+    """Check that an identity is a valid WHO."""
     if not WHO.fullmatch(who):
         raise UsageError(
             f"{who!r} cannot be an identity: 1 to 64 letters, digits, '_', '-' and '.', the first one a letter or digit"
@@ -171,7 +171,7 @@ def way_of(packet: bytes) -> str:
 
 
 def is_report(packet: bytes) -> bool:
-    """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong once it is late."""
+    """Return whether a packet reports a stream's state. It may be lost, because a late report would be wrong."""
     return packet[:6] == _REPORT
 
 

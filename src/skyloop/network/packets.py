@@ -50,7 +50,7 @@ class Taken(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Acknowledges frames of a topic up to a number."""
+    """Acknowledges all frames of a topic up to a number."""
 
     topic: str
     number: int
@@ -119,7 +119,7 @@ decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet may be for the transport itself, rather than for the handler."""
+    """Return whether a packet may be meant for the transport itself rather than for the handler."""
     return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
 
 
@@ -176,7 +176,7 @@ def parse(packet: bytes) -> Message:
 
 
 def parse_own(packet: bytes) -> Message | None:
-    """Decode one of the transport's own packets; return None if it is for the handler or garbage."""
+    """Decode one of the transport's own packets. Return None if it is meant for the handler, or is garbage."""
     if not is_own(packet):
         return None
     try:
@@ -213,7 +213,7 @@ def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, by
 
 # Attachments ---------------------------------------------------------------------------------------------------
 
-#: Attachment of a packet sent to one end: its number, from 1; 0 for the transport's own packets, which are not counted.
+#: Attachment of a packet sent to one end: the packet's number, from 1. The transport's own packets all have number 0.
 number = _NUMBER.pack
 
 

@@ -1,4 +1,4 @@
-"""Keep a proxy's connections: admit applications and end connections.
+"""Manage a proxy's connections: admit applications and end connections.
 
 A connection is ended if its application is gone, has lost its rights, or acknowledges nothing.
 """
@@ -34,8 +34,8 @@ STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
 T = TypeVar("T")
-#: After this number of consecutive commands, handle one other packet, so that endless commands can't stop others from
-#: requesting authority.
+#: After this number of consecutive commands, handle one other packet, so that an endless series of commands can't stop
+#: others from requesting authority.
 IN_A_ROW: Final = 16
 
 #: Items for the thread that calls the handler: a packet, True for joined, or False for left.
@@ -74,14 +74,14 @@ class ConnectionRegistry:
         self._tokens = Tokens(by_key=ring is not None)  # tokens of live connections
         self._connections: dict[str, ServerConnection] = {}
         self._peers: dict[int, ServerConnection] = {}
-        self._left = threading.Condition()  # notified when a connection is gone
+        self._left = threading.Condition()  # notified when a connection has ended
         self._last_id = 0
-        self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
+        self._shut: frozenset[str] = frozenset()  # identities that were excluded when the topic key was made
         self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
-        self.turned_away = 0  #: number of connections and tokens refused because of the limits
-        self._away = ""  # why they were turned away, until the handler has been notified
-        self.strays = 0  #: number of samples and queries without a connection
-        self._stray_commands = 0  # number of commands and requests among them, not yet reported to the handler
+        self.turned_away = 0  #: number of connections and tokens that were refused because of the limits
+        self._away = ""  # why connections were turned away, until the handler has been notified
+        self.strays = 0  #: number of samples and queries that belong to no connection
+        self._stray_commands = 0  # number of commands and requests among those packets, not yet reported to the handler
 
     def open(self) -> None:
         """Start admitting applications."""
@@ -109,14 +109,14 @@ class ConnectionRegistry:
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
-        """Return the connection that a key belongs to; :class:`DecodeError` if none has this id and identity."""
+        """Return the connection that a key belongs to. Raises :class:`DecodeError` if none has this id and identity."""
         connection = self._connections.get(sender.id)
         if connection is None or connection.who != sender.who:
             raise DecodeError("it is not connected")
         return connection
 
     def is_shut_out(self, connection: ServerConnection) -> bool:
-        """Return whether a newer roster excludes the key of a connection; if so, end the connection."""
+        """Return whether a newer roster excludes the key of a connection. If it does, end the connection."""
         if self._ring is None or connection.who not in self._ring.shut_out:
             return False
         self._shut_out(connection, _SHUT_OUT)
@@ -125,7 +125,7 @@ class ConnectionRegistry:
     def stray(self, key: str) -> None:
         """Count a packet without a connection, given the key on which it arrived."""
         self.strays += 1
-        if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive late
+        if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive after it has left
             self._stray_commands += 1
 
     # --- callbacks, on Zenoh's threads ---
@@ -160,7 +160,7 @@ class ConnectionRegistry:
                 self.strays += 1
                 return
             if request.run != self._run:
-                return  # meant for another proxy with this name
+                return  # intended for another proxy with this name
             try:
                 admission = self._admit(sender, request)
                 problem = self._join(sender, request, admission)
@@ -300,7 +300,7 @@ class ConnectionRegistry:
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
         """Disconnect an application and drop its unhandled packets. Any thread.
 
-        With ``forget=False``, the connection is removed when the application answers or its token disappears.
+        With ``forget=False``, the connection is removed only when the application answers or its token disappears.
         """
         self._hang_up(connection, reason)
         connection.ended = True
@@ -320,7 +320,7 @@ class ConnectionRegistry:
             self._left.notify_all()
 
     def _shut_out(self, connection: ServerConnection, reason: str) -> None:
-        """Disconnect an application, but still handle its earlier packets."""
+        """Disconnect an application. Packets that it sent earlier are still handled."""
         self._hang_up(connection, reason)
         self.end(connection, reason)
 
@@ -366,7 +366,7 @@ class _TurnQueue(Generic[T]):
 
 
 class HandlerQueue(Generic[T]):
-    """The queue for the thread that calls a handler: commands come first, and connections take turns.
+    """The queue of packets for the thread that calls a handler. Commands come first, and connections take turns.
 
     Items of equal urgency from one connection stay in order.
     """
@@ -389,7 +389,7 @@ class HandlerQueue(Generic[T]):
             return True
 
     def waiting(self, of: Hashable) -> int:
-        """Return how many of a connection's non-urgent items are queued."""
+        """Return how many of a connection's queued items are not urgent."""
         with self._changed:
             return self._others.count(of)
 
@@ -411,6 +411,6 @@ class HandlerQueue(Generic[T]):
 
     @property
     def over(self) -> bool:
-        """Whether the queue is closed and empty."""
+        """Whether the queue is closed and contains no more items."""
         with self._changed:
             return self._closed and not self._urgent and not self._others

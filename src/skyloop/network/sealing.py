@@ -71,7 +71,7 @@ class Open:
     """Opens packets sealed by the other end's :class:`Seal`, each only once. Any thread."""
 
     tag = TAG  #: bytes that sealing adds to a payload
-    trailer = TRAILER  #: bytes that sealing adds to an attachment
+    trailer = TRAILER  #: number of bytes that sealing adds to an attachment
 
     def __init__(self) -> None:
         self._ciphers: dict[int, ChaCha20Poly1305] = {}
@@ -142,7 +142,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals packets for all of a proxy's applications, with a key that changes when one of them is excluded."""
+    """Seals packets for all of a proxy's applications. The key changes when an application is excluded."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -168,7 +168,7 @@ class TopicSeal:
 
 
 def _cipher(key: bytes) -> ChaCha20Poly1305:
-    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # imported only if there are keys
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # imported only if keys are used
 
     return ChaCha20Poly1305(key)
 
@@ -180,7 +180,7 @@ def _forged() -> type[Exception]:
 
 
 def _bound(where: str, attachment: bytes) -> bytes:
-    """Return the bytes that are authenticated along with the data.
+    """Return the bytes that are authenticated along with the payload.
 
     Keys contain no zero byte, so nothing can be shifted from one part to the other.
     """

@@ -1,8 +1,8 @@
 """The proxy's end of the fabric transport.
 
 Zenoh's threads only sort incoming packets. A separate thread calls the handler, commands first, so that a slow handler
-does not delay signs of life. A third thread sends to individual applications, so that an application that acknowledges
-nothing does not delay the handler. Sending never blocks on an application.
+does not delay keep-alive packets. A third thread sends to individual applications, so that an application that
+acknowledges nothing does not delay the handler. Sending never blocks on an application.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from skyloop.transport.priority import SUPERSEDED, is_command
 if TYPE_CHECKING:
     import zenoh
 
-FAREWELL_S: Final = 0.5  #: time that applications get to receive the reason when a transport server stops
+FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
 _POLL_S: Final = 0.5  # interval between checks of the connections
-_REFUSED: Final = b""  # represents a refused packet
+_REFUSED: Final = b""  # represents a packet that was refused
 _COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
 _log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ class FabricServer(TransportServer):
         self._session: Session | None = None
         self._declared: list[Any] = []
         self._thread: threading.Thread | None = None
-        self.refused = 0  #: number of packets not allowed on their key
+        self.refused = 0  #: number of packets that were not allowed on their key
 
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
@@ -268,7 +268,7 @@ class FabricServer(TransportServer):
             self._registry.end(connection, message.reason)
         return True
 
-    # --- the thread that calls the handler ---
+    # --- on the thread that calls the handler ---
 
     def _serve(self, handler: ServerHandler) -> None:
         checked = time.monotonic()

@@ -30,7 +30,7 @@ _BORROWED_S: Final = 0.001  # … and the pause between them
 #: Parts of Zenoh's error texts: positions in its source code, and what it adds to an endpoint's address.
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
-_ATTEMPTS: Final = 5  # attempts to get a free port before another process takes it
+_ATTEMPTS: Final = 5  # number of attempts to get a free port before another process takes it
 Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: Zenoh's priorities in use, highest first
 
 
@@ -44,7 +44,7 @@ class Session:
         self.retired = False  #: not given to new users, because there is a better one
         self.idle_since = 0.0
         self.opened = time.monotonic()
-        self.listens: list[str] = []  #: addresses it listens on
+        self.listens: list[str] = []  #: network addresses that it listens on
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
@@ -81,7 +81,7 @@ class Session:
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
     def over(self, now: float) -> bool:
-        """Return whether the session has been unused for long enough to close it. For use by the pool."""
+        """Return whether the session has been unused for long enough to close it. Called only by the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ def reason_of(error: BaseException) -> str:
 
 
 class _Pool:
-    """All of this process's sessions. A thread closes unused ones, and ends when there are none."""
+    """All of this process's sessions. A thread closes unused ones, and ends when none are left."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -138,7 +138,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back. Once unused, it stays open for :data:`LINGER_S` if it may linger."""
+        """Give a session back. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -160,9 +160,9 @@ class _Pool:
     def close_all(self) -> None:
         """Close all sessions when the process ends.
 
-        Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh: on
-        returning to Python, such a thread would be ended by an exception that can't pass through native code, which
-        aborts the process ("FATAL: exception not rethrown").
+        Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh.
+        When such a thread returns to Python, an exception ends it. That exception can't pass through native code, so
+        the process would abort ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -231,7 +231,7 @@ def host_name() -> str:
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session that has no other users with one at the same addresses that uses the newest roster.
+    """Replace a session that has no other users with a session at the same addresses that uses the newest roster.
 
     All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
     not become free again within :data:`REOPEN_S`.
@@ -249,7 +249,7 @@ def renewed(session: Session) -> Session:
 
 
 def undeclare(held: Iterable[Any]) -> None:
-    """Undeclare a session's declarations, last first. Must not be called on Zenoh's threads."""
+    """Undeclare a session's declarations in reverse order. Must not be called on Zenoh's threads."""
     ended: type[Exception] = load().ZError
     for each in reversed([*held]):
         for _ in range(_BORROWED):

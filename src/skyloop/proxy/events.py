@@ -38,14 +38,14 @@ _log = logging.getLogger(__name__)
 
 
 class Counters:
-    """Counts, and the recent command delays. Each name is counted under a single lock, or by a single thread."""
+    """Counters, and the delays of recent commands. Each name is counted under one lock or on one thread."""
 
     def __init__(self) -> None:
         self.counts: defaultdict[str, int] = defaultdict(int)
         self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: delays of accepted commands, from sending to applying
 
     def snapshot(self, **now: float) -> dict[str, float]:
-        """Return all counters, the distribution of command delays [s], and the caller's additions."""
+        """Return all counters, the distribution of command delays [s], and the counters that the caller adds."""
         values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
         values.update(now)
         delays = sorted(self.delays_ns.copy())
@@ -102,7 +102,7 @@ class EventPublisher:
                 self._send([replace(draft, data={**draft.data, "count": 1})])
 
     def tick(self, now_ns: int) -> None:
-        """Publish how many events were repeated or not delivered. Call several times a second."""
+        """Publish how many events were repeated and how many could not be delivered. Call several times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
@@ -225,7 +225,7 @@ def clamped_event(name: str, clamp: Clamp) -> EventDraft:
 
 
 def enforcement_event(enforced: bool) -> EventDraft:
-    """Return the event for starting or ceasing to enforce the safety box and zones."""
+    """Return the event for the safety box and zones being enforced, or no longer being enforced."""
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
@@ -239,7 +239,7 @@ def thin_zones_event(space: Space) -> EventDraft:
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event for a jump of the position; ``lands``: whether the vehicle was landing."""
+    """Return the event for a jump of the position. ``lands``: whether the vehicle was landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
@@ -253,7 +253,7 @@ def given_up_event(what: str) -> EventDraft:
 
 
 def drift_event(drifts: bool) -> EventDraft:
-    """Return the event for the velocity becoming unknown to the software autopilot, or known again."""
+    """Return the event for the software autopilot losing the velocity, or having it again."""
     if not drifts:
         text = "the vehicle's velocity is known again: its drift is corrected"
         return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.INFO, data={"reason": "drift", "active": False})
@@ -294,7 +294,7 @@ def taken_event(name: str, action: str, others: str) -> EventDraft:
 
 
 def ownership_event(changed: Changed) -> EventDraft:
-    """Return the event for a flight that belongs to others, or to an earlier run."""
+    """Return the event for a flight that is someone else's, or from an earlier run."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
 

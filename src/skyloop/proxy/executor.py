@@ -62,12 +62,12 @@ class ActionExecutor:
 
     @property
     def state(self) -> FlightState:
-        """The current flight state, which may be more recent than the last feedback."""
+        """The current flight state. It may be more recent than the last feedback."""
         return self.flight.state(self._publisher.reported_state)
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies or may fly; without a reported state, it may from the first command on."""
+        """Whether the vehicle flies or may fly. Without a reported state, it may fly after the first command."""
         return self.flight.flies(self.state)
 
     @property
@@ -82,7 +82,7 @@ class ActionExecutor:
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
 
     def observe(self, now_ns: int) -> Changed | None:
-        """Observe the vehicle; if its flight has changed hands, return the change."""
+        """Observe the vehicle, and return the change if its flight has changed hands."""
         try:
             left_to = self._driver.left_to()
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
@@ -91,13 +91,13 @@ class ActionExecutor:
         return self.flight.observe(self._publisher.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
-        """Return the newest sample if it shows the current state."""
+        """Return the newest sample if it contains the current state."""
         feedback = self._publisher.feedback_now if self._publisher.link_up else None
         return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
     @property
     def stands(self) -> bool:
-        """Whether the vehicle reports that it is on the ground, even if the software autopilot is about to take off."""
+        """Whether the vehicle reports being on the ground, even if the software autopilot is about to take off."""
         return self._publisher.reported_state is FlightState.LANDED
 
     def stop_autopilot(self) -> None:
@@ -109,7 +109,7 @@ class ActionExecutor:
         """Execute a supported action, and return what was actually applied. Raises the driver's errors.
 
         ``new``: whether it is an application's new request rather than a repeat. Raises :class:`RefusedError` if the
-        vehicle certainly won't follow in its present state.
+        vehicle certainly won't follow commands in its present state.
         """
         autopilot = self.autopilot
         try:
@@ -202,8 +202,8 @@ class ReturnSupervisor:
     """Flies the vehicle back to its start for the failsafe ladder, and provides the related feedback fields."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
-        self.start: Vec3 | None = None  #: where the vehicle took off, the same as in feedback [m]
-        self.phase = ReturnPhase.NONE  #: progress of the return, the same as in feedback
+        self.start: Vec3 | None = None  #: where the vehicle took off, as reported in feedback [m]
+        self.phase = ReturnPhase.NONE  #: progress of the return, as reported in feedback
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
@@ -216,9 +216,9 @@ class ReturnSupervisor:
         self._problem, self._good_ns = "", now_ns
 
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
-        """Observe the start, and fly back if the ladder requires it; return whether feedback must change.
+        """Update the start position, and fly back if the ladder requires it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's own; a vehicle flown by others does not return on our behalf.
+        ``ours``: whether the flight is the proxy's. Vehicles flown by others do not return on the proxy's behalf.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
@@ -247,7 +247,7 @@ class ReturnSupervisor:
         return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
     def _fly(self, seen: Snapshot) -> None:
-        """Take the next step of the ladder's return; the ladder handles objections."""
+        """Take the next step of the ladder's return. The ladder handles any objections."""
         now_ns = seen.now_ns
         if not seen.link_up:
             self._good_ns = now_ns  # nothing is known, so there is no objection

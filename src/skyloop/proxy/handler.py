@@ -1,4 +1,4 @@
-"""The command handler, which executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler. It executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ class CommandHandler(FlightSupervisor):
         return Done()
 
     def release_authority(self, session: Session, _request: ReleaseAuthority, now_ns: int) -> AnyReply:
-        """Take the authority back from an application, or remove it from the queue."""
+        """Take the authority away from an application, or remove it from the queue."""
         with self._lock:
             self._apply_authority(self.authority.release(session.app_id, now_ns), now_ns)
         return Done()
@@ -199,11 +199,11 @@ class CommandHandler(FlightSupervisor):
             holder = self.authority.holder
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease
 
-    # Commands: all but the first are called under the lock ----------------------------------------------------------
+    # Commands: all methods but the first are called under the lock --------------------------------------------------
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
-        """Check a command and execute it, on the receiving thread."""
-        # After the computer has slept, an old command looks as if it had just been sent: restore its true age.
+        """Check a command and execute it on the receiving thread."""
+        # After the computer has slept, an old command looks as if it had just been sent: correct the command's age.
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -223,7 +223,7 @@ class CommandHandler(FlightSupervisor):
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Return what was applied and when; for a refused command, when it was received."""
-        # On a machine that was idle, which is usual before a command, each function call costs microseconds. Ordinary
+        # On a machine that was idle, as is usual before a command, each function call costs microseconds. Ordinary
         # commands are therefore received, judged and executed here; error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
@@ -294,7 +294,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # Observe the return before reporting the intent, because "arrived" would still refer to the previous return.
+        # Observe the return before reporting the intent. Otherwise "arrived" would still refer to the previous return.
         if fresh and self._returns.observe():
             self._stamp()
         self._report_intent(session)
@@ -368,7 +368,7 @@ class CommandHandler(FlightSupervisor):
     def _refuse_intent(
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
-        """Refuse the holder's intent and end it, so that its repeats get the same answer."""
+        """Refuse the holder's intent and end it, so that repeats of the intent get the same answer."""
         intent.refuse(reason, why)
         self._report_intent(session)
         kind, seen = type(command.action), self._executor.seen(now_ns)

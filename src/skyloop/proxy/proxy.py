@@ -1,8 +1,8 @@
-"""The proxy, a node through which any number of applications observe a vehicle and one at a time flies it.
+"""The proxy, a node that lets any number of applications observe a vehicle and one at a time fly it.
 
-Threads: those of the transport execute commands and pass on poses, those of the driver publish, a ticker (50 Hz)
-    updates authority, failsafe and autopilot, and one more answers requests. The handler's lock is held during every
-    driver call that flies the vehicle, including those in :meth:`end`.
+Threads: the transport's threads execute commands and pass on poses. The driver's threads publish. A ticker (50 Hz)
+    updates authority, failsafe and autopilot, and one more thread answers requests. The handler's lock is held during
+    every driver call that flies the vehicle, including those in :meth:`end`.
 """
 
 from __future__ import annotations
@@ -77,10 +77,10 @@ _log = logging.getLogger(__name__)
 class Proxy:
     """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
 
-    Applications connect by ``name``, which has 1 to 64 characters. ``clock`` gives the time of all samples [ns]. With
-    ``ticker=False``, the caller calls :meth:`tick`, for example for many proxies in a process, or in simulated time.
-    ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept`` returns how long
-    the computer has slept in total [ns]; the default is the system's if ``clock`` is.
+    Applications connect by ``name``, which must have 1 to 64 characters. ``clock`` gives the time of all samples [ns].
+    With ``ticker=False``, the caller must call :meth:`tick`, for example for many proxies in one process or in
+    simulated time. ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept``
+    returns how long the computer has slept in total [ns]; its default is the system's if ``clock`` is the system's.
     """
 
     def __init__(
@@ -205,7 +205,7 @@ class Proxy:
             raise
         if self._trail is not None:
             self._trail.begin(str(self.driver.uri))
-        if self._record is not None:  # now that the name is ours
+        if self._record is not None:  # the name is ours from here on
             left_s = self._record.left_s()
             if left_s > 0.0:
                 self.handler.flight.began_before(self.clock() + nanoseconds(left_s))
@@ -231,19 +231,19 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight, then the proxy, and release all resources. Idempotent. Not for the driver's own threads.
+        """End the flight, then the proxy, and release all resources. Idempotent. Must not be called by the driver.
 
         First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
         flying. A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in
         time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
-        without the proxy is still landed, however long it takes, because otherwise it would fall. With
+        without the proxy is still landed, however much time has passed, because it would fall otherwise. With
         ``unless_flying``, the landing and the proxy continue if the vehicle does not land in time. With ``hangs``, the
-        driver hangs or fails: nothing waits for it, it is not asked to land or hover, and calls that may hang are left
-        to daemon threads, as if the proxy had been killed.
+        driver hangs or fails: nothing waits for the driver, and it is not asked to land or hover. Calls that may hang
+        are left to daemon threads, as if the proxy had been killed.
 
-        Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done; if
+        Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done. If
         the driver hangs, errors are logged instead.
         """
         if not self._started or self.ended:
@@ -275,7 +275,7 @@ class Proxy:
         return landed
 
     def _land(self, within_s: float, hurry: Callable[[], bool]) -> bool:
-        """Land a flying vehicle; return whether no flight of the proxy remains."""
+        """Land the vehicle if it flies; return whether no flight of the proxy remains."""
         handler, hovers = self.handler, "hover" in self.capabilities.actions
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s and not (hovers and hurry()):
@@ -329,7 +329,7 @@ class Proxy:
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle an application's packet, on the receiving thread."""
+        """Handle an application's packet on the receiving thread."""
         now_ns = self.clock()
         session = self._sessions.get(peer.id)
         if session is None or session.ended:
@@ -358,7 +358,7 @@ class Proxy:
             self._malformed(session, f"{kind.__name__} may only be sent by the proxy", now_ns)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Count and report a packet not allowed by the sender's keys, or whose sender is not connected."""
+        """Count and report a packet that the sender's keys don't allow, or whose sender is not connected."""
         session = self._sessions.get(peer.id)
         name = None if session is None else session.name
         code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
@@ -444,7 +444,7 @@ class Proxy:
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
-        """End connections that have sent no Hello, because they take up places."""
+        """End connections that have sent no Hello, because they occupy places."""
         for session in list(self._sessions.values()):
             if session.role is None and not session.ended and now_ns - session.joined_ns > HELLO_NS:
                 session.ended = True
@@ -480,7 +480,7 @@ class Proxy:
         return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
 
     def statistics(self) -> dict[str, float]:
-        """Return all counters by dotted name, the same as for ``GetStatistics``. Thread-safe."""
+        """Return all counters by dotted name, as ``GetStatistics`` does. Thread-safe."""
         return self._counters.snapshot(applications=self.applications, **self.server.counters)
 
     @property

@@ -55,8 +55,8 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2"
 class VehiclePublisher:
     """The driver's :class:`skyloop.drivers.base.Sink`, and the newest known state of the vehicle.
 
-    It acquires no lock that is held while the driver is called, so a driver may call it on any thread, even
-    re-entrantly.
+    It never acquires a lock that is held while the driver is called, so a driver may call it on any thread, even from
+    inside such a call.
 
     ``state_of`` returns the flight state, given the driver's, because the software autopilot may know better.
     ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
@@ -78,7 +78,7 @@ class VehiclePublisher:
         self.feedback_now: Feedback | None = None  #: the newest sample, as it was published
         self.reported_state = FlightState.UNKNOWN  #: the state reported by the driver, without the software autopilot
         self.link_state = LinkState.CONNECTING
-        self.link_reason = ""  #: what is being waited for, and the last failure
+        self.link_reason = ""  #: what the link is waiting for, and its last failure
         self.link_remedy = ""  #: what a person can do about it
         self.link_up = False
         self.link_breaks = 0  #: number of times the link went down or came back
@@ -148,7 +148,7 @@ class VehiclePublisher:
 
     @property
     def is_shown(self) -> bool:
-        """Whether feedback shows the current state of the proxy and the link."""
+        """Whether feedback contains the current state of the proxy and the link."""
         return self._published_ns >= 0
 
     def keep_alive(self, now_ns: int) -> None:
@@ -330,7 +330,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded frames have receivers."""
+        """Return whether anyone receives this camera's encoded frames."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
@@ -372,7 +372,7 @@ class VehiclePublisher:
             self._events.publish(kind, text, severity, data=data)
 
     def driver_failed(self, where: str, error: BaseException) -> str:
-        """Report that a call of the driver failed; return the text for the requester."""
+        """Report that a driver call failed; return the text for the requester."""
         self._counts["driver.errors"] += 1
         self._fail(where, f"driver failed in {where}: {error!r}")
         return self._scrub(f"the driver failed: {error!r}")

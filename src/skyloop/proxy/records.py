@@ -4,8 +4,8 @@ The audit trail records who flew when, as one JSON object per line, append-only.
 :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
 The note records that a flight is this proxy's, so that a proxy that was killed and restarted ends its own flight. It is
-written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over, belongs to
-others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
+written when a flight becomes the proxy's, and refreshed during the flight. It is removed when the flight is over, is
+someone else's, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Event, EventKind, FlightState
 from skyloop.proxy.core.flight import BELIEF_NS
 
-CLOSE_S: Final = 2.0  #: how long ending a proxy waits for each file
+CLOSE_S: Final = 2.0  #: time to wait for each file when a proxy ends
 FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
 _MODE: Final = 0o600
@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line of an audit trail, whose other fields depend on ``what``."""
+    """One line of an audit trail. Its other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
@@ -123,7 +123,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """Return a file's entries and the number of unreadable lines (for example, cut off by a crash)."""
+    """Return a file's entries, and the number of unreadable lines (for example, lines cut off by a crash)."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
@@ -188,7 +188,7 @@ class AuditTrail:
 
     def _write(self, line: bytes) -> None:
         try:
-            os.write(self._file, line)  # a single call, so that the lines of several writers do not mix
+            os.write(self._file, line)  # a single call, so that lines from several writers do not mix
             self._failed = False
         except OSError as error:
             if not self._failed:  # a full disk is logged once, and the flight continues
@@ -207,7 +207,7 @@ def record_path(name: str) -> Path:
 
 
 class FlightRecord:
-    """The file with one proxy's flight record, written on a separate thread from :meth:`start` to :meth:`close`.
+    """The file that holds one proxy's flight record. A separate thread writes it from :meth:`start` to :meth:`close`.
 
     ``vehicle``: the vehicle's address, because notes about other vehicles are ignored; ``wall``: the wall clock [s].
     """
@@ -250,7 +250,7 @@ class FlightRecord:
         if thread is not None:
             self._closing = True
             self._changed.set()
-            thread.join(CLOSE_S)  # a file system may hang, but the end of the proxy must not
+            thread.join(CLOSE_S)  # a file system may hang, but the proxy must still end
 
     def _run(self) -> None:
         closing = False

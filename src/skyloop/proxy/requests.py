@@ -1,9 +1,9 @@
 """Handle connections and their requests: each request is executed once and answered as often as it is sent.
 
-A client repeats a request, with the same number, until its answer arrives. A repeat of a pending request is merged with
-it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state (Hello,
-authority, Ping) are answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
-Requests that may involve the driver are answered on a separate thread.
+A client repeats a request, with the same number, until it receives the answer. A repeat of a pending request is merged
+with it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state
+(Hello, authority, Ping) are answered immediately on the receiving thread, so that a take-over never waits behind a slow
+parameter. Requests that may involve the driver are answered on a separate thread.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat
 MAX_MESSAGE: Final = 1000  #: maximum number of characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
-#: Requests that change something. Others may be answered again, with the state at the time of the repeat.
+#: Requests that change the proxy's state. Others may be answered again, with the state at the time of the repeat.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 _log = logging.getLogger(__name__)
@@ -66,8 +66,8 @@ class Session:
         self.intents = Intents()
         self.episodes = Episodes()
         self.answers = Answers()
-        self.authority_request = 0  #: number of the newest request to acquire or release the authority
-        self.ended = False  #: whether the proxy has disconnected it, so that further packets are ignored
+        self.authority_request = 0  #: number of the newest request for acquiring or releasing the authority
+        self.ended = False  #: whether the proxy has disconnected the application and therefore ignores further packets
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
@@ -89,7 +89,7 @@ class Answers:
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
         """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
 
-        Returns whether the request has been or is being executed, and whether the limit has been reached.
+        Returns whether the request has been executed or is being executed, and whether the limit has been reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -116,7 +116,7 @@ class JobQueue(Protocol):
         """Start running jobs."""
 
     def put(self, job: Callable[[], None]) -> None:
-        """Queue a job, which must not raise. Thread-safe."""
+        """Queue a job. The job must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
         """Stop after the current job; if that takes longer than this, leave it to its daemon thread."""
@@ -181,7 +181,7 @@ class RequestDispatcher:
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
+        """End after the current job. If a driver hangs for longer, leave it to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:

@@ -28,14 +28,14 @@ from skyloop.transport.base import TransportServer
 LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
 ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
 _POLL_S: Final = 0.2
-GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; waiting is printed only afterwards
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; a waiting message is printed only later
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 K = TypeVar("K")
 
 #: Returns updates about the network's keys, one sentence each.
 Look = Callable[[], Sequence[str]]
-#: Runs something, such as an endpoint for metrics, alongside the proxies of a process.
+#: Runs an additional service, such as an endpoint for metrics, alongside the proxies of a process.
 Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
@@ -76,7 +76,7 @@ class Shutdown:
 
     def __init__(self) -> None:
         self.requested = threading.Event()
-        self.hurry = threading.Event()  #: set to end without landing first
+        self.hurry = threading.Event()  #: set if the process must end without landing first
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
@@ -104,11 +104,11 @@ def serve(
     ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
-    Until then it writes ``serving`` and, at each change, what it is waiting for, the last failure and a remedy (not
+    Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
     with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s];
     a second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
-    which occurs when the parent dies, and leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
-    called several times a second; the updates about keys that it returns are logged, and published as an event.
+    which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
+    called several times a second. The updates about keys that it returns are logged and published as an event.
 
     Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
@@ -141,11 +141,11 @@ def run(
 ) -> None:
     """Serve several vehicles from one process, such as the drones of one simulated world; see :func:`serve`.
 
-    Starts the proxies, and stops them at the end; writes lines for each, as :func:`serve` does. ``audit``: file for the
-    audit trail; by default each proxy has one in the user's state directory, except private ones (with ``parent_fd``).
-    ``records``: whether to keep an audit trail, and a note about the flight for the next run; by default, private
-    proxies keep none, because they are never restarted under their name. ``beside``: a context entered while the
-    proxies run.
+    Starts the proxies, and stops them at the end. Writes lines for each, as :func:`serve` does. ``audit``: file for the
+    audit trail. By default, each proxy has a file in the user's state directory, except private proxies (those with
+    ``parent_fd``). ``records``: whether to write an audit trail, and a note about the flight for the next run. By
+    default, private proxies write neither, because they are never restarted under their name. ``beside``: a context
+    that is entered while the proxies run.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -180,7 +180,7 @@ def run(
                 _log.warning("%s", change)
                 for proxy in proxies:
                     proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
-            if parent_fd is None:  # a parent gets the proxy's events, and might not read this output
+            if parent_fd is None:  # a parent process gets the proxy's events, and may not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
 
@@ -197,7 +197,7 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 
 
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
-    """End several proxies at the same time with :meth:`Proxy.end`, then raise the first of their errors.
+    """End several proxies at the same time with :meth:`Proxy.end`. Then raise the first of their errors.
 
     Ctrl-C, unless it is handled elsewhere, ends the wait for landings, and is raised when all have ended.
     """
@@ -251,7 +251,7 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. Main thread only."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end of the process. Main thread only."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)

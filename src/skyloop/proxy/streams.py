@@ -31,16 +31,16 @@ from skyloop.transport.frame_encoding import resized_header
 
 MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
 KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requests for key frames
-IDLE_S: Final = 1.0  #: a stream ends its thread after this time without subscribers
+IDLE_S: Final = 1.0  #: a stream's thread ends after this time without subscribers
 GOOD_BITS: Final = 0.2  #: bits per pixel beyond which images hardly improve
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-_FPS: Final = 30.0  # assumed rate of cameras that do not announce one
+_FPS: Final = 30.0  # assumed frame rate of cameras that do not announce one
 _BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the image, because each change costs a key frame
 #: Fraction of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
-#: If they overload the path, they are retried after this time, which doubles with each failure.
+#: If they overload the path, they are retried after this time. The time doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # highest rate tried for the vehicle's own stream [kbit/s]
@@ -83,8 +83,8 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own stream may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether that stream is being forwarded, as long as its frames keep arriving
-        self._own_ns = 0  # when its newest frame arrived
+        self._passing = False  # whether that stream is being forwarded; this requires that its frames keep arriving
+        self._own_ns = 0  # time at which its newest frame arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards everything below, and the rate
@@ -96,14 +96,14 @@ class StreamForm:
         self._ended = False
         self._encoder: H264Encoder | None = None
         self._needs_encoder = False  # whether a new encoder is needed
-        self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0: unknown
+        self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0 if unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # a time, so that a recreated stream continues with higher numbers
+        self._seq = clock() // 1_000_000  # the current time, so that a recreated stream continues with higher numbers
 
     @property
     def passing(self) -> bool:
-        """Whether the vehicle's own stream is being forwarded; False if the vehicle has stopped sending it."""
+        """Whether the vehicle's own stream is being forwarded; False if the vehicle has stopped sending the stream."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
     @property
@@ -192,7 +192,7 @@ class StreamForm:
             self._own_bytes, self._own_since_ns = 0, now_ns
 
     def end(self) -> None:
-        """End the thread, and wait for its current frame."""
+        """End the thread after its current frame, and wait for it."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -212,7 +212,7 @@ class StreamForm:
     def _next(self) -> _Picture | None:
         with self._changed:
             if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
-                # This thread holds the lock, so a later put() starts another thread.
+                # This thread holds the lock, so a later put() will start another thread.
                 self._thread = None
                 self._encoder = None
                 self._wants_key = True
@@ -255,7 +255,7 @@ class StreamForm:
         )
 
     def _follow_path(self, header: FrameHeader) -> int:
-        """Choose the rate, and the size and frame rate that match it; return the rate [kbit/s]."""
+        """Choose the rate, and the frame size and frame rate that match it; return the rate [kbit/s]."""
         if self._rate is None:
             return self._kbit_s
         now_ns = self._clock()
@@ -285,7 +285,7 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a format can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
+        """Reserve a place for a format and return ""; if it can't be subscribed to, return the reason. Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
                 f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "

@@ -62,8 +62,8 @@ from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
-_NOTICED_M_S: Final = 0.05  #: reductions of the software autopilot's steps that are smaller than this are not reported
-#: Minimum additional sleep time of the computer that is handled; less can't be distinguished from a delay.
+_NOTICED_M_S: Final = 0.05  #: software autopilot set-points that are reduced by less than this are not reported
+#: Minimum additional sleep time of the computer that is handled. A shorter sleep can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
@@ -114,7 +114,7 @@ class FlightSupervisor:
         self._breaks_seen = 0  # number of breaks of the vehicle link at the last check
         self._heard_ns = -LATEST_NS  # time of the last tick that found the vehicle link up
         self._slept = slept
-        self._slept_seen = slept()  # value at the last check
+        self._slept_seen = slept()  # time the computer had slept in total at the last check
         self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and when it ended
         #: Deadline for a take-off that was sent but has had no visible effect yet; None if there is none.
         self._rising_until_ns: int | None = None
@@ -126,7 +126,7 @@ class FlightSupervisor:
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
-        """Start the run, before the server starts. A flight from an earlier run waits for its pilot."""
+        """Start the run, before the server starts. A flight from an earlier run waits until its pilot returns."""
         self.authority.last_command_ns = now_ns
 
     def tick(self, now_ns: int) -> None:
@@ -172,7 +172,7 @@ class FlightSupervisor:
         """React to changes of the vehicle link since the last call.
 
         Intents end when the link breaks and again when it returns, so that no old command is executed later. Both times
-        a hover is sent, because a driver must not continue an old set-point. A landing continues.
+        a hover is sent, because a driver must not continue an old set-point. A landing in progress continues.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -189,7 +189,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Abandon a hover or landing if the vehicle has long been silent, because it may be on another flight by then.
+        """Give up a hover or landing after a long silence of the vehicle, because it may be on another flight by then.
 
         After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
         to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may be present.
@@ -215,7 +215,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """React to the computer having slept, after which everything is older than its timestamp suggests."""
+        """Handle the computer having slept, because all data is then older than its timestamp suggests."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -250,7 +250,7 @@ class FlightSupervisor:
         """Observe the vehicle, and react if its flight has changed hands."""
         executor, flight = self._executor, self.flight
         changed = executor.observe(now_ns)
-        if self.on_ownership is not None and not flight.awaited:  # otherwise the note stays unchanged
+        if self.on_ownership is not None and not flight.awaited:  # otherwise the note remains as it is
             self.on_ownership(flight.ours)
         if changed is not None:
             self._stamp()
@@ -258,7 +258,7 @@ class FlightSupervisor:
                 executor.stop_autopilot()
                 why = f"{flight.others}: hover, take off or land first to take it over"
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
-            elif changed.why:  # our own flight has turned up, and its pilot may return: measure the silence from now
+            elif changed.why:  # our own flight was found, and its pilot may return: restart the silence
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
             if changed.why and executor.supported:  # a replay has no pilot to surprise
                 self._events.publish_drafts(ownership_event(changed))
@@ -306,21 +306,21 @@ class FlightSupervisor:
     def _observe_takeoff(self, now_ns: int) -> None:
         """Withdraw a take-off past its deadline, even if a set-point has replaced it."""
         if self._rising_until_ns is not None and not self._executor.stands:
-            self._rising_until_ns = None  # it has left the ground
+            self._rising_until_ns = None  # the vehicle has left the ground
         elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
         """Cancel a take-off that has had no visible effect yet; return whether there was one.
 
-        A landing sent to a vehicle on the ground cancels an arming that is still in progress.
+        A landing command sent to a vehicle on the ground cancels an arming that is still in progress.
         """
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
         if self._executor.attempt(_LAND, now_ns, "apply"):
             self.flight.call_off(now_ns)
-        elif self.flight.ours:  # retry while that take-off may still take effect
+        elif self.flight.ours:  # retry while the earlier take-off may still take effect
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
@@ -381,7 +381,7 @@ class FlightSupervisor:
         self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:
-        """Update the holder, the failsafe's step and the flight's owner in feedback."""
+        """Update the holder, the failsafe's step and the flight's owner in the feedback."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
         waiting = authority.waiting
@@ -416,7 +416,7 @@ class FlightSupervisor:
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._observe_vehicle(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
-            ladder.continue_landing(now_ns)  # a hover must not interrupt its pilot's landing
+            ladder.continue_landing(now_ns)  # a hover must not interrupt the landing that its pilot requested
         inputs = FailsafeInputs(
             state=seen.state,
             airborne=flight.flies(seen.state),

@@ -31,14 +31,14 @@ from skyloop.transport.base import (
     video,
 )
 
-#: Topics that don't contain a name.
+#: The topics whose names are fixed.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
 PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
-MAX_VARIANTS: Final = 16  #: maximum number of simultaneous variants of feedback, each with any number of subscribers
+MAX_VARIANTS: Final = 16  #: maximum number of simultaneous feedback variants, each with any number of subscribers
 #: How long a requested variant keeps its place without subscribers, because a subscription may be in transit.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
@@ -92,7 +92,7 @@ class Forms(Generic[F]):
         self._most = most
         self._subscribers = subscribers
         self._clock = clock
-        self._lock = threading.Lock()  # guards changes of the known variants
+        self._lock = threading.Lock()  # guards changes to the set of known variants
 
     def find(self, topic: str) -> F | None:
         """Return the variant of a topic; None if it was never requested."""
@@ -132,7 +132,7 @@ class FeedbackVariants(Forms[_Variant]):
         self._counts = counters.counts
 
     def problem(self, topic: str) -> str:
-        """Return why a variant can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
+        """Reserve a place for a variant and return ""; if it can't be subscribed to, return the reason. Thread-safe."""
         try:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
@@ -147,7 +147,7 @@ class FeedbackVariants(Forms[_Variant]):
     def publish(self, sample: Feedback, now_ns: int) -> None:
         """Publish a sample in each variant for which it is due. One thread at a time.
 
-        ``now_ns`` is not the capture time, which does not advance while the vehicle is silent.
+        ``now_ns`` must not be the capture time, which does not advance while the vehicle is silent.
         """
         for variant in self.known:
             if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
@@ -169,7 +169,7 @@ class FeedbackVariants(Forms[_Variant]):
 
 
 class OverviewRegistry:
-    """The rows of all proxies in a process, encoded once for all of them. Thread-safe."""
+    """The rows of all proxies in a process, encoded once and shared by all of them. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -215,7 +215,7 @@ class OverviewPublisher:
     def share(self, registry: OverviewRegistry) -> None:
         """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy but not another, because they would see all rows.
+        Does nothing if applications may have access to only some of the proxies, because they would see all rows.
         """
         if not self._server.restricted:
             self.registry = registry
@@ -238,7 +238,7 @@ class OverviewPublisher:
 
 
 def _encoded(page: Overview) -> list[bytes]:
-    """Encode rows as one packet, or as several if they don't fit."""
+    """Encode rows as one packet, or as several if they don't fit into one."""
     try:
         return [encode(page)]
     except ValueError:

@@ -4,8 +4,8 @@ A transport carries whole packets between one proxy (the *transport server*) and
 clients*). It knows packets and topics, but not their meaning. An implementation must pass the tests in
 :mod:`skyloop.transport.conformance`.
 
-- No call ever blocks on the other end. A packet that does not fit at that moment is not sent, and the caller gets
-  False.
+- No call ever blocks on the other end. A packet that does not fit into the buffer at that moment is not sent, and the
+  caller gets False.
 - A packet arrives whole or not at all. Packets of one connection keep their order. A packet has 1 to
   :data:`MAX_PACKET` bytes; sending any other raises :class:`skyloop.errors.UsageError`.
 - Handlers run on the transport's receiving threads, one call at a time per end, so they must return quickly. A handler
@@ -34,7 +34,7 @@ EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: log entries of applications (LogEntry)
-OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
+OVERVIEW = "overview"  #: one row for each vehicle in the proxy's process, once a second (Overview)
 MAX_TOPIC = 200  #: maximum number of characters in a topic's name
 MAX_SUBSCRIPTIONS = 64  #: maximum number of simultaneous topics per connection
 RESULTS = "results"  #: results of all processors (ProcessorResult)
@@ -64,7 +64,7 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The transport server's view of an application's connection."""
+    """What the transport server knows about an application's connection."""
 
     id: int  #: unique in this run of the transport server, from 1
     address: str  #: readable address: process id and user, or host and port
@@ -74,10 +74,10 @@ NOBODY = Peer(0, "an unknown application")
 
 
 class ServerHandler(Protocol):
-    """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
+    """A server's callbacks. They run on its receiving threads, one at a time except for :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, before its first packet. Later calls identify it by an equal ``Peer``."""
+        """Handle a new connection, before its first packet. Later calls identify the peer by an equal ``Peer``."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
@@ -86,9 +86,9 @@ class ServerHandler(Protocol):
         """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
 
     def topic_problem(self, topic: str) -> str:
-        """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.
+        """Return why a topic can't be subscribed to, and which topics exist; empty if it can.
 
-        May be called on any thread, even while another callback runs, and must answer at once.
+        May be called on any thread, even while another callback runs, and must return at once.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -118,19 +118,19 @@ class TransportServer(ABC):
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to every subscriber of a topic; return the number of those that did *not* receive it."""
+        """Send a packet to every subscriber of a topic; return the number of subscribers that did *not* receive it."""
 
     @abstractmethod
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
         """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
 
-        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, otherwise :class:`UsageError` is
-        raised; they may be reused after the call.
+        ``pixels``: ``header.size`` bytes of dtype uint8, in any shape, C-contiguous. Otherwise :class:`UsageError` is
+        raised. They may be reused after the call.
         """
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; samples need not be produced if there are none."""
+        """Return the number of a topic's subscribers. If there are none, samples need not be produced."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
         """Return why an application that has identified itself may not stay; empty if it may, which is the default.
@@ -156,7 +156,7 @@ class TransportServer(ABC):
     @property
     @abstractmethod
     def address(self) -> str:
-        """Readable address of this end."""
+        """Readable address of this end of the connection."""
 
 
 class ClientHandler(Protocol):
@@ -199,21 +199,21 @@ class TransportClient(ABC):
         """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.
 
         Meanwhile the handler runs on this thread, still one call at a time. Returns False if another thread is
-        receiving, so that the caller must wait as usual; ``wake`` is then called once, on another thread, when a retry
-        may succeed. By default, this is not supported. ``ready`` returns whether the wait is over; it is called on this
+        receiving. The caller must then wait as usual, and ``wake`` is called once, on another thread, when a retry may
+        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. It is called on this
         thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
         """
         return False
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is inside :meth:`lead` and must not wait for its own packets."""
+        """Whether the calling thread is inside :meth:`lead`, and therefore must not wait for its own packets."""
         return False
 
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends are on one host and read the same monotonic clock, so that the offset is zero.
+        """Whether both ends are on one host and read the same monotonic clock. If so, the offset is zero.
 
         An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
         """
@@ -241,7 +241,7 @@ class TransportClient(ABC):
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
-#: Valid names for proxies, which can be used as a socket's file name and as one chunk of a network key.
+#: Valid names for proxies. Each can be used as the file name of a socket and as one chunk of a network key.
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
@@ -267,7 +267,7 @@ def check_topic(topic: str) -> None:
 
 
 def too_many_topics(topic: str) -> str:
-    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics can't get more."""
+    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics can't get another."""
     return f"{topic[:64]!r} exceeds the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
 
 

@@ -1,4 +1,4 @@
-"""Combine several transport servers into one, for a proxy that serves its host and the network at once."""
+"""Combine several transport servers into one, for a proxy that serves its own host and the network at the same time."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ class CompositeServer(TransportServer):
             raise
 
     def stop(self) -> None:
-        """Stop all ends at the same time, and wait for them unless called from a handler.
+        """Stop all ends at the same time, and wait for them unless this is called from a handler.
 
         Waiting inside a handler would deadlock: its caller holds the lock that the stopping end waits for.
         """
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
             thread.start()
-        if not self.lock.held:  # otherwise an end would wait for the lock that this thread holds
+        if not self.lock.held:  # otherwise, ending it would mean waiting for the lock that this thread holds
             for thread in threads:
                 thread.join()
 
@@ -106,14 +106,14 @@ class CompositeServer(TransportServer):
 
 
 class _EndHandler:
-    """The handler at one end: forwards calls under the composite's lock, with the composite's peers."""
+    """The handler for one end. It calls the composite's handler with the composite's peers, under its lock."""
 
     def __init__(self, whole: CompositeServer, end: TransportServer, handler: ServerHandler) -> None:
         self._whole = whole
         self._lock = whole.lock
         self._end = end
         self._handler = handler
-        self._peers: dict[int, Peer] = {}  # our peers, by the end's number
+        self._peers: dict[int, Peer] = {}  # our peers, by the numbers that the end gave them
 
     def peer_joined(self, peer: Peer) -> None:
         with self._lock:

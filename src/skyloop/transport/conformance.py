@@ -1,4 +1,4 @@
-"""Conformance tests for transports: subclass :class:`TransportSuite` in your tests, and provide your two ends.
+"""Conformance tests for transports. Subclass :class:`TransportSuite` in your tests and provide your two ends.
 
 ::
 

@@ -48,7 +48,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
-        # The centre of the first pixel is (0, 0), so the fixed point of the scaling is its corner at (-0.5, -0.5).
+        # The first pixel's centre is at (0, 0). Scaling therefore leaves its corner at (-0.5, -0.5) in place.
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )

@@ -36,7 +36,7 @@ from skyloop.transport.base import (
 
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
-DEPTH = 256  #: maximum number of packets waiting at an end; further ones are dropped
+DEPTH = 256  #: maximum number of packets waiting at one end; further packets are dropped
 FRAME_DEPTH = 4  #: maximum number of a camera's frames waiting at a client; the newest replaces the one before it
 
 _log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
+    """A proxy's end. Its :meth:`dial` is a :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -156,7 +156,7 @@ class MemoryServer(TransportServer):
 
 
 class MemoryClient(TransportClient):
-    """An application's end, made by :meth:`MemoryServer.dial`."""
+    """An application's end of the transport, made by :meth:`MemoryServer.dial`."""
 
     def __init__(self, server: MemoryServer, peer: Peer, handler: ClientHandler, faults: Faults) -> None:
         self.peer = peer
@@ -170,7 +170,7 @@ class MemoryClient(TransportClient):
         self._down = FaultInjector(faults, f"{peer.id}/down")
         self._up_lock = threading.Lock()
         self._down_lock = threading.Lock()
-        # Items: a packet, the name of a camera with a frame to deliver, or None if the connection has ended.
+        # Items: a packet, the name of a camera that has a frame to deliver, or None once the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
         self._ended = False  # whether either end has ended the connection, so that nothing can be sent
@@ -188,7 +188,7 @@ class MemoryClient(TransportClient):
             handler.packet(self.peer, packet)
 
     def report(self, handler: ServerHandler, problem: str) -> None:
-        """Tell the server's handler about a malformed request."""
+        """Report a malformed request to the server's handler."""
         if not self.muted:
             handler.malformed(self.peer, problem)
 

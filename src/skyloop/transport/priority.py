@@ -1,4 +1,4 @@
-"""Commands first: the order in which packets, and the threads that bring them, reach the proxy.
+"""Commands first: the order in which packets, and the threads that carry them, reach the proxy.
 
 A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, handling
 outdated set-points costs time, only for them to be refused as stale, and the proxy gets even later. Therefore in a
@@ -22,15 +22,15 @@ from skyloop.messages import Command, Idle, decode
 from skyloop.messages.codec import KINDS
 from skyloop.messages.command import SET_POINTS
 
-SUPERSEDED: Final = "commands.superseded"  #: counter of commands replaced by newer ones
+SUPERSEDED: Final = "commands.superseded"  #: number of commands that newer ones replaced
 MOST_PACKETS: Final = 256  #: maximum number of packets taken out of a socket before the first of them is handled
-MOST_BYTES: Final = 131_072  #: maximum total size of these packets
+MOST_BYTES: Final = 131_072  #: maximum total size of the packets taken out
 _NOTHING: Final[tuple[bytes, Command | None]] = (b"", None)
 _COMMAND: Final = bytes([KINDS[Command]])
 
 
 def is_command(packet: bytes) -> bool:
-    """Return whether a packet is a command or an emergency stop, which is handled before everything else."""
+    """Return whether a packet is a command or an emergency stop. Both are handled before all other packets."""
     return packet[5:6] == _COMMAND
 
 
@@ -52,7 +52,7 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may have been removed
+        self._set_point = self._idle = self._last = 0  # numbers of the newest slots, which may have been removed
 
     def __len__(self) -> int:
         return len(self._waiting)
@@ -111,7 +111,7 @@ class PacketBacklog:
     def _drop(self, number: int, newer: Command) -> int:
         """Drop an older command if it is still waiting; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # a network may have reordered them
+        if older is None or older.seq >= newer.seq:  # a network may have changed their order
             return 0
         self._take(number)
         return 1
@@ -129,7 +129,7 @@ def _command(packet: bytes) -> Command | None:
 
 
 class PriorityLock:
-    """A re-entrant lock that each holder hands to the next waiter.
+    """A re-entrant lock. Each holder hands it to the thread that waits next.
 
     ``with lock:`` waits behind all others, ``lock.acquire(urgent=True)`` only behind other urgent waiters.
     """
@@ -145,7 +145,7 @@ class PriorityLock:
     def acquire(self, urgent: bool = False) -> None:
         """Wait for the lock, ahead of all non-urgent waiters if ``urgent``; the owner may acquire it again."""
         me = threading.get_ident()
-        if self._taken.acquire(False):  # the usual case, in as few steps as possible
+        if self._taken.acquire(False):  # the most frequent case, handled in as few steps as possible
             self._owner = me
             return
         if self._owner == me:
@@ -155,8 +155,8 @@ class PriorityLock:
         woken.acquire()
         with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
-        self._hand_over()  # the lock may have been released since the first attempt
-        woken.acquire()  # the releaser has made this thread the owner
+        self._hand_over()  # the lock may have been released after the first attempt
+        woken.acquire()  # the releasing thread has made this thread the owner
 
     def release(self, *_: object) -> None:
         """Release the lock once, as its owner (not checked); the last release hands it over."""

@@ -1,6 +1,6 @@
 """Helpers for testing transports and their users: handlers that record their calls.
 
-Nothing here sleeps for a fixed time; :func:`wait_until` waits for a condition, but no longer than :data:`PATIENCE_S`.
+Nothing here sleeps for a fixed time. :func:`wait_until` waits for a condition, but no longer than :data:`PATIENCE_S`.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ class ServerLog:
 class ClientLog:
     """A client's handler that records its calls.
 
-    With ``keep=False``, a frame's pixels are compared with :func:`picture` at once rather than kept, and ``torn`` lists
-    the numbers of frames that differ.
+    With ``keep=False``, each frame's pixels are compared with :func:`picture` immediately and not stored, and ``torn``
+    lists the numbers of frames that differ.
     """
 
     def __init__(self, *, keep: bool = True) -> None:

@@ -3,8 +3,8 @@
 A link's certificates only identify the neighbour on that *link*, which may be a router. The two ends of a connection
 therefore also present their certificates to each other, in an exchange like those of SIGMA (Krawczyk, CRYPTO 2003) and
 TLS 1.3: each end signs a fresh X25519 share together with the terms of the connection; the proxy also signs the
-application's whole message. The secrets, unknown to any router, are derived from both shares and the transcript
-(HKDF-SHA256). Replayed messages are therefore useless, and a key that leaks later can't decrypt earlier recordings.
+application's whole message. The secrets are derived from both shares and the transcript (HKDF-SHA256). No router knows
+them. Replayed messages are therefore useless, and a key that leaks later can't decrypt earlier recordings.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class KeyRing:
         return self._listed != frozenset(self._in_force.identities)
 
     def admits(self, identity: Identity) -> bool:
-        """Return whether the newest roster lists this identity with these rights, and it was never excluded."""
+        """Return whether the newest roster lists this identity with these rights and has never excluded it."""
         return identity in self._listed and identity.name not in self.shut_out
 
     def refresh(self) -> None:
@@ -69,8 +69,8 @@ class KeyRing:
     def poll(self, now: datetime | None = None) -> list[str]:
         """Read the roster if its file has changed, and return messages for users, one sentence each.
 
-        These announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported, and
-        the previous one stays in force.
+        These messages announce a newer roster and, once an hour, a certificate that expires within a week. A roster
+        that can't be read is reported, and the previous roster stays in force.
         """
         now = now or datetime.now(UTC)
         with self._lock:
@@ -115,7 +115,7 @@ def _stamp(credentials: Credentials) -> tuple[int, int, int]:
 
 
 class Proof(msgspec.Struct, frozen=True, array_like=True):
-    """The proof that one end sends to the other."""
+    """The proof that each end sends to the other."""
 
     certificate: bytes  #: DER
     share: bytes  #: X25519, 32 bytes
@@ -129,11 +129,11 @@ class Agreed:
     identity: Identity  #: the other end's identity
     expires: datetime  #: expiry of the other end's certificate
     up: bytes  #: secret for the application's packets
-    down: bytes  #: secret for the proxy's packets
+    down: bytes  #: secret that seals the proxy's packets
 
 
 class Agreement:
-    """One end's part in the exchange, using its keys; both ends have the same ``terms`` of the connection."""
+    """One end's part in the exchange, using its keys. Both ends have the same ``terms`` of the connection."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring

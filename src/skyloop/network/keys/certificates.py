@@ -24,7 +24,7 @@ try:
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:  # always installed where tests run
+except ImportError as error:  # always installed where the tests run
     raise MissingExtraError("keys", "network", cause=str(error)) from None
 
 PrivateKey = ec.EllipticCurvePrivateKey
@@ -88,7 +88,7 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Create the authority of a new lab. Its name ends in random digits to distinguish labs."""
+    """Create the authority of a new lab. Its name ends in random digits to tell labs apart."""
     return _self_signed(f"Skyloop lab {secrets.token_hex(4)}", days, now)
 
 
@@ -178,7 +178,7 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 
 
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Decode a private key on an elliptic curve, read from a file."""
+    """Decode an elliptic-curve private key that was read from a file."""
     try:
         key = serialization.load_pem_private_key(content, password=None)
     except (ValueError, TypeError):  # TypeError is raised for an encrypted key
@@ -214,7 +214,7 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return the name that access control uses; empty if the certificate has none or several."""
+    """Return the name that access control uses; empty if the certificate contains no name or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 

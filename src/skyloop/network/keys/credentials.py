@@ -1,4 +1,4 @@
-"""Load and check an identity's folder for a program, watch it for a newer roster; encode and decode rosters.
+"""Load and check an identity's folder for a program and watch it for a newer roster; encode and decode rosters.
 
 ================  ==============================================================================
 ``ca.pem``        the certificate of the lab's authority
@@ -8,7 +8,7 @@
 ================  ==============================================================================
 
 Zenoh's access control identifies subjects by common name, so all names must be known wherever it is enforced. The
-roster file has two parts: the list itself, and a signature of exactly those bytes. Its number increases with each
+roster file has two parts: the list, and a signature of exactly the list's bytes. The number increases with each
 change, and the roster with the highest number applies.
 """
 
@@ -175,7 +175,7 @@ class Credentials:
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and verify all of it. Raises :class:`UsageError`, which says how to fix it."""
+    """Read an identity's folder and verify all its files. Raises :class:`UsageError`, which says how to fix it."""
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
     _check_folder(path)
@@ -195,7 +195,7 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the public certificate and the roster from the folder of a lab or an identity."""
+    """Read the public certificate and the roster from a folder of a lab or an identity."""
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
     authority = _read_authority(directory)
@@ -203,7 +203,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_warning(what: str, end: datetime, now: datetime) -> str:
-    """Return a sentence for users if the expiry has passed or is less than a week away; otherwise an empty string."""
+    """Return a sentence for users if the key has expired or expires within a week; otherwise an empty string."""
     left = end - now
     if left > NOTICE:
         return ""
@@ -298,7 +298,7 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a directory against changes by other processes; wait for the lock, which ends with its process."""
+    """Lock a directory against changes by other processes. Waits for the lock, which ends with its process."""
     try:
         import fcntl
     except ImportError:

@@ -1,10 +1,10 @@
 """Identities on the network (a name, a role, and the drones that the role applies to), and Zenoh's access control.
 
 A node applies the rules to the neighbour on each of its links, identified by the common name in the neighbour's
-certificate. What that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward
-(egress), and everything else is blocked. Each end thus protects itself, regardless of how others are configured. A
-router may publish and subscribe to everything, and applies the rules to its own neighbours; traffic through it is
-sealed, so that it cannot forge anything (:mod:`skyloop.network.sealing`).
+certificate. What that identity may *publish* is let in (ingress), what it may *subscribe* to is let out (egress), and
+everything else is blocked. Each end therefore protects itself, however the others are configured. A router may publish
+and subscribe to everything, and applies the rules to its own neighbours; traffic through it is sealed, so that it
+cannot forge anything (:mod:`skyloop.network.sealing`).
 
 The two directions mirror each other: proxies subscribe to what applications publish, and vice versa. Declarations and
 queries count as messages in the direction in which they travel, so a subscriber's declaration counts as published.
@@ -42,7 +42,7 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 class KeyRole(StrEnum):
-    """What a key permits with respect to its identity's drones."""
+    """What a key permits its owner to do with the drones of its identity."""
 
     PILOT = "pilot"  #: may see every drone, and fly its own
     OBSERVER = "observer"  #: may see its drones, but not fly any
@@ -96,8 +96,8 @@ class Identity:
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
     """Create an identity from user input.
 
-    The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and is not ``anyone``; ``role`` is a value
-    of :class:`KeyRole`; ``drones`` are names or patterns separated by commas; for a router, ``*``.
+    The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and must not be ``anyone``. ``role`` is a
+    value of :class:`KeyRole`. ``drones`` are names or patterns, separated by commas; for a router, ``*``.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(

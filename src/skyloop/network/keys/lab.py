@@ -8,8 +8,8 @@
 ================  ========================================================================
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
-separate authority, in a folder next to the lab's keys. Users have their browsers trust it, which is safe because it
-can't certify anything beyond private networks. Its key and the lab's key are not interchangeable.
+separate authority, in a folder next to the lab's key folder. Users have their browsers trust it, which is safe because
+it can't certify anything beyond private networks. Its key and the lab's key can't replace each other.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust
@@ -58,14 +58,14 @@ _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
 FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
 
-PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
+PAGE_DAYS: Final = 366  #: browsers reject certificates that are valid for much longer
 RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left
 
 
 class Lab:
     """An authority that can issue identities, created by :meth:`make` or opened by :meth:`open`.
 
-    Each change is made under a lock on the folder, so that no change by another process is lost.
+    Each change holds a lock on the folder, so that a change by another process at the same time is not lost.
     """
 
     def __init__(self, directory: Path, authority: Authority) -> None:
@@ -137,7 +137,7 @@ class Lab:
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Revoke an identity, wherever the new roster is installed, and delete the files in its folder here."""
+        """Revoke an identity wherever the new roster is installed, and delete its folder's files here."""
         with locked(self.directory):
             roster = self.roster
             entry = roster.find(name)
@@ -178,7 +178,7 @@ class PageFiles:
 def page_certificate(
     directory: Path, own: Sequence[str], wanted: Sequence[str] = (), now: datetime | None = None
 ) -> PageFiles:
-    """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
+    """Return a certificate for a cockpit's page: the existing certificate if it is suitable, otherwise a new one.
 
     ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
     names given by the user, which the authority must be able to certify.

@@ -2,10 +2,10 @@
 
 Every wall is a plane: those of the safety box and, for each no-fly zone, the plane through its nearest point that is
 perpendicular to the line of sight. The whole zone is behind that plane, because zones are convex. Inside a zone, the
-plane through which the vehicle entered is kept, so that the vehicle is led back to the side it came from. At distance
-``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the reaction time
-``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its component along the plane. An
-attitude passes unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
+plane through which the vehicle entered is remembered, so that the vehicle is led back to the side that it came from. At
+distance ``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the
+reaction time ``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its component along the
+plane. An attitude passes unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from skyloop.proxy.core.flight import STALE_NS
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
-LOST_NS: Final = 2 * NS_PER_S  #: age of a position beyond which it is not worth waiting for the next
+LOST_NS: Final = 2 * NS_PER_S  #: if a position is older than this, the next one is not worth waiting for
 BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
-#: A position has jumped if it changes by more than this, and by more than the vehicle could have flown.
+#: A position counts as having jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; any further out, only moving back is allowed
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further out, the vehicle may only move back
 BRAKE_GAIN: Final = 2.0  #: requested deceleration per unit of excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further beyond a wall
+RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further past a wall
 #: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
@@ -38,12 +38,12 @@ LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be th
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
 _BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
 _OLD_S: Final = 1.0  # maximum age taken into account for a position, because the vehicle may be at rest
-_AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
+_AT_REST_M_S: Final = 0.05  # below this speed, vehicles may report the same position repeatedly
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
 _NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
-_PASSES: Final = 8  # maximum number of times that a velocity is reduced by all walls in turn before a stop is demanded
+_PASSES: Final = 8  # maximum number of passes in which all walls in turn reduce a velocity before a stop is required
 
-#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches that
+#: Permitted climb rate for each metre below ``limits.altitude`` [1/s]. It slows the vehicle down as it approaches that
 #: altitude. Above the limit, it sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
 #: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
@@ -57,7 +57,7 @@ class Clamp:
     limit: str  #: name of the parameter
     asked: float
     applied: float
-    zone: str = ""  #: name of the no-fly zone, if any
+    zone: str = ""  #: name of the no-fly zone, if there is one
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +120,7 @@ class Verdict(NamedTuple):
 
     action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
     clamps: tuple[Clamp, ...] = ()  #: the limits that applied
-    refusal: Refusal | None = None  #: None also (like ``action``) if the request only waits for the next fresh position
+    refusal: Refusal | None = None  #: also None (like ``action``) while the request only waits for a fresh position
     why: str = ""  #: readable reason for the refusal
     enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
 
@@ -142,7 +142,7 @@ class Airspace:
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
     ) -> Verdict:
-        """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
+        """Judge a new or repeated request with finite numbers. ``now_ns`` is on the clock of ``feedback.captured_ns``.
 
         Unless the request is ``new``, a permitted target stays permitted: the steps avoid an obstacle that drift puts
         in the way, and a lower ceiling lowers the target. ``planned``: whether the target is part of a route that was
@@ -205,7 +205,7 @@ class Airspace:
     def observe(self, feedback: Feedback | None) -> None:
         """Update what is known about the vehicle's position: its age, its side of each zone, and the ground below it.
 
-        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown.
+        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown in that time.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -401,7 +401,7 @@ class Airspace:
         return Verdict(Hover() if self._blocked else sink, clamps, enforced=enforced)
 
     def _takeoff(self, action: Takeoff, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Refuse to take off inside a no-fly zone, or into one."""
+        """Refuse a take-off that begins in a no-fly zone or leads into one."""
         if feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return Verdict(action)
         x, y, z = feedback.position_m
@@ -416,7 +416,7 @@ class Airspace:
         return sorted(height for _, height in self._ground)[len(self._ground) // 2]
 
     def ceiling(self, feedback: Feedback) -> float:
-        """Return the maximum height here, in world axes [m]; infinite if the ground is unknown."""
+        """Return the maximum height at this point, in world axes [m]; infinite if the ground is unknown."""
         ground = self._ground_below(feedback)
         return math.inf if ground is None else ground + self.settings.limits.altitude
 
@@ -469,7 +469,7 @@ def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
 
 
 def _fastest(at: Vec3, place: Vec3, limits: Limits) -> tuple[float, str]:
-    """Return the maximum speed along the line within the horizontal and vertical limits, and the binding limit."""
+    """Return the maximum speed along the line within the horizontal and vertical limits, and the limit that applies."""
     across, up = math.dist(at[:2], place[:2]), abs(place[2] - at[2])
     away = math.hypot(across, up)
     if away < _NO_WAY_M:

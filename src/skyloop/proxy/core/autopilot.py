@@ -37,14 +37,14 @@ from skyloop.proxy.core.airspace import Airspace, Clamp
 from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: period of the steps for which the autopilot is designed
+PERIOD_S: Final = 0.02  #: step period that the autopilot is designed for
 ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
 GO_GAIN: Final = 0.9  #: speed per remaining metre on the way to a target [1/s]
 GO_SPEED: Final = 1.0  #: maximum speed on the way to a target if none is given [m/s]
 GO_DECELERATION: Final = 0.6  #: deceleration towards the target [m/s²]
-TURN_GAIN: Final = 1.5  #: yaw rate per remaining radian [1/s]
+TURN_GAIN: Final = 1.5  #: yaw rate per radian that remains to turn [1/s]
 TURN_RATE: Final = 1.2  #: maximum yaw rate if none is given [rad/s]
 SETTLED_SPEED: Final = 0.2  #: speed below which a hover fixes its position [m/s]
 ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
@@ -66,7 +66,7 @@ SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position",
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:
-    """Return the actions that the autopilot adds to a vehicle's native ones."""
+    """Return the actions that the autopilot adds to a vehicle's native actions."""
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
@@ -74,7 +74,7 @@ def software_actions(native: frozenset[str]) -> frozenset[str]:
 
 @dataclass(frozen=True, slots=True)
 class AutopilotSettings:
-    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
+    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], and gains [rad per m/s] and [rad per m]."""
 
     takeoff_altitude: float = 1.0
     climb: float = 0.5
@@ -89,7 +89,7 @@ class ReturnSettings:
     """Settings of a return."""
 
     height: float = 2.0  #: minimum height above the start on the way [m]
-    speed: float = 1.0  #: maximum speed on the way [m/s]
+    speed: float = 1.0  #: maximum speed on the way back [m/s]
     land: bool = True  #: whether to land at the end rather than hover
 
 
@@ -123,7 +123,7 @@ class Autopilot:
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
         self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
-        #: Returns the permitted velocity for a desired one, given the newest feedback; not called during a landing.
+        #: Returns the permitted velocity for a desired one, given the newest feedback. Not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
@@ -139,7 +139,7 @@ class Autopilot:
     def start(
         self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
     ) -> None:
-        """Start a task; :meth:`step` continues it. Repeats of the current task change nothing."""
+        """Start a task; :meth:`step` continues it. Repeating the current task changes nothing."""
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
@@ -166,7 +166,7 @@ class Autopilot:
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
-        """Handle the vehicle's refusal of a set-point; a take-off is over if the vehicle ``reported`` being landed."""
+        """Handle the vehicle's refusal of a set-point. If it ``reported`` being landed, a take-off is over."""
         if self.flight.refused(reported):
             self.mode = Mode.OFF
 
@@ -175,7 +175,7 @@ class Autopilot:
     ) -> Attitude | Velocity | None:
         """Return the set-point to send now; None while the autopilot is off. Call every :data:`PERIOD_S`.
 
-        ``reported``: the flight state from the driver, which may differ from that in ``feedback``.
+        ``reported``: the flight state reported by the driver, which may differ from the state in ``feedback``.
         """
         if self.mode is Mode.OFF:
             return None
@@ -205,7 +205,7 @@ class Autopilot:
         return self._target
 
     def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
-        """Climb until the altimeter (failing that, the position, or the time) indicates enough height."""
+        """Climb until the altimeter (if there is none, the position or the time) indicates enough height."""
         settings = self.settings
         altitude = known.altitude_m if known is not None else None
         height = known.position_m[2] if known is not None and known.position_m is not None else None
@@ -315,13 +315,13 @@ def _shorten(x: float, y: float, most: float) -> tuple[float, float]:
 
 
 class StartPoint:
-    """Keeps the position where the vehicle last left the ground, in world axes."""
+    """Stores the position where the vehicle last left the ground, in world axes."""
 
     def __init__(self) -> None:
         self.position: Vec3 | None = None  #: the position [m]; None if unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # start of the current period on the ground; None in the air
-        self._flew = False  # whether it has been seen in the air
+        self._standing_ns: int | None = None  # start of the current period of time on the ground; None in the air
+        self._flew = False  # whether the vehicle has been seen in the air
         self._open = False  # whether the vehicle is taking off and its position is not known yet
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
@@ -356,11 +356,11 @@ class ReturnDecision(NamedTuple):
     refusal: Refusal | None = None  #: None also (like ``action``) if the return only waits for a fresh position
     why: str = ""  #: readable reason for the refusal
     lasting: bool = False  #: whether it is pointless to wait for a fresh position
-    enforced: bool | None = None  #: whether safety box and zones were enforced; None if there are none, or no target
+    enforced: bool | None = None  #: whether box and zones were enforced; None if none are set or there is no target
 
 
 class ReturnFlight:
-    """One flight back to the start; ``settings`` provide what the action does not specify."""
+    """One return flight to the start. The settings fill in what the action does not specify."""
 
     def __init__(self, action: ReturnToStart, start: Vec3 | None, settings: ReturnSettings) -> None:
         self.phase = ReturnPhase.NONE
@@ -371,7 +371,7 @@ class ReturnFlight:
         self._land = settings.land if action.land is None else action.land
         self._target: Vec3 = (0.0, 0.0, 0.0)
         self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered if the ceiling is lower
-        self._over: Vec3 = (0.0, 0.0, 0.0)  # the point above the start
+        self._over: Vec3 = (0.0, 0.0, 0.0)  # the point directly above the start
         self._left_m, self._left_ns = math.inf, 0  # the shortest remaining distance so far, and when it was reached
         self._stepped_ns = 0
 
@@ -395,7 +395,7 @@ class ReturnFlight:
         return ReturnDecision(None, place.clamps, place.refusal, place.why)
 
     def _plan(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision | None:
-        """Start, or continue with the next leg; return an objection, if any."""
+        """Start, or continue with the next leg; return the objection, if any."""
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
@@ -418,7 +418,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # Outside the box or inside a zone, don't climb first, because the straight line leads back.
+        # Outside the box or inside a zone, the vehicle must not climb first, because the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:

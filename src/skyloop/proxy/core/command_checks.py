@@ -1,7 +1,7 @@
-"""Track an application's intents from start to end, and check each command. Pure.
+"""Track each of an application's intents from start to end, and check each command. Pure.
 
-The library repeats each command many times a second. A repeat refers to its intent: it is judged again while the intent
-is in progress, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends one.
+The library repeats each command many times a second. A repeat refers to its intent. It is checked again during the
+intent, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends an intent.
 
 The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
 whether a command is a sign of life of the holder); then whether its intent is in progress, the vehicle link, support,
@@ -47,13 +47,13 @@ from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
 MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
-TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn
+TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground after this time is withdrawn
 #: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates of intents whose repeats are refused without explanation
 _LANDINGS: Final = (Land, ReturnToStart)
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: after these, the next repeat may succeed
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: the next repeat after one of these may succeed
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
@@ -62,7 +62,7 @@ _TAKING: Final = (Takeoff, Hover, Land)  #: actions that, as new requests, take 
 
 @dataclass(slots=True)
 class Intent:
-    """One request of an application."""
+    """One request from an application."""
 
     number: int
     action: AnyAction
@@ -77,7 +77,7 @@ class Intent:
 
     @property
     def over(self) -> bool:
-        """Whether this intent has ended; repeats of it then have no effect."""
+        """Whether this intent has ended. Repeats of an ended intent have no effect."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
@@ -129,7 +129,7 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """Return the intent's outcome for feedback, given the application's name and the vehicle's state there.
+        """Return the intent's outcome for the feedback, given the application's name and the vehicle's state in it.
 
         A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
@@ -212,7 +212,7 @@ class StatePolicy(Enum):
 
     APPLY = auto()
     HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
-    HOVER = auto()  #: for a take-off requested in flight, hover instead
+    HOVER = auto()  #: if a take-off is requested in flight, hover instead
     REFUSE = auto()
 
 
@@ -224,7 +224,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: If the state is unknown, all actions are passed on, because some vehicles never report it.
+#: In an unknown state, all actions are passed on, because some vehicles never report their state.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -276,8 +276,8 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: Actions that a person may command while nothing is received from the vehicle. It may still receive us, and
-        #: otherwise only the emergency stop could bring it down.
+        #: Actions that a person may command while nothing is received from the vehicle. It may still receive our
+        #: commands. Without us, only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
@@ -295,7 +295,7 @@ class CommandChecks:
     ) -> Decision:
         """Decide on a command whose intent is in progress, other than an emergency stop or idle.
 
-        ``new``: whether it is the application's new request, not a repeat or the library's own (``automatic``).
+        ``new``: whether this is a new request, and neither a repeat nor one that the library makes (``automatic``).
         """
         now_ns, state, feedback, link, _ = seen
         kind = type(action)
@@ -305,14 +305,14 @@ class CommandChecks:
         if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
             policy = StatePolicy.HOLD  # an automatic hover does not abort a landing
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
-            policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
+            policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received other commands since then
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
         if lands and is_set_point and not self.keeps_failsafe(kind, seen, automatic=automatic):
-            policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's
+            policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's landing
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         if policy is StatePolicy.HOLD:
@@ -353,7 +353,7 @@ class CommandChecks:
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
     def begin_return(self, action: ReturnToStart) -> None:
-        """Start a return, replacing any other."""
+        """Start a return, replacing any return in progress."""
         self.way_back = ReturnFlight(action, self.start.position, self.returns)
 
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
@@ -362,7 +362,7 @@ class CommandChecks:
         return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
-        """Return why the vehicle could not start a return flight that ends in a landing now; empty if it could."""
+        """Return why the vehicle can't start a return flight that ends in a landing now; empty if it can."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
@@ -370,7 +370,7 @@ class CommandChecks:
     def _problem(
         self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
-        """Return what forbids a command from the holder, regardless of the policy for the flight state."""
+        """Return the reason that forbids a command from the holder, regardless of the policy for the flight state."""
         state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic

@@ -52,13 +52,13 @@ class FailsafeSettings:
     retry_s: float = 0.25
     battery_warn: float = 0.2
     battery_land: float = 0.1  #: charge at which to land; 0: never
-    battery_return: float = 0.0  #: charge at which to return; 0: never
+    battery_return: float = 0.0  #: battery charge at which to return; 0: never
     returns: bool = False  #: whether a vehicle without a pilot lands at its start
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeInputs:
-    """Inputs for the ladder's decisions."""
+    """What the ladder's decisions are based on."""
 
     state: FlightState
     airborne: bool
@@ -68,17 +68,17 @@ class FailsafeInputs:
     battery: float | None
     ours: bool = True  #: whether an application of this proxy started the flight or took it over
     return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
-    shown: bool = True  #: whether the state is current; False: the last state of a vehicle no longer received
+    shown: bool = True  #: whether the state is current; if False, the vehicle is no longer received
 
 
 @dataclass(frozen=True, slots=True)
 class StepChange:
-    """A step that began or ended, to be published."""
+    """The start or end of a failsafe step, ready to be published."""
 
     step: Failsafe
     reason: str
     returns: bool = False  #: whether the vehicle flies back to its start and lands there
-    why: str = ""  #: readable reason why it does not return although it should
+    why: str = ""  #: readable reason why the vehicle does not fly back although it should
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ class FailsafeLadder:
         self.settings = settings or FailsafeSettings()
         self.step = Failsafe.NONE
         self.reason = ""
-        self.barred = ""  #: why set-points are refused at present: ``battery``, ``closing``, or empty
+        self.barred = ""  #: why set-points are currently refused: ``battery``, ``closing``, or empty if they are not
         self._closing = False
         self._warned = False
         self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
@@ -147,7 +147,7 @@ class FailsafeLadder:
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # leave a flight by others alone, whatever its problems
+        if not inputs.ours:  # leave a flight by others alone, whatever problems it has
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
@@ -163,7 +163,7 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers continue a landing only while requested
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers land only while asked to
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
@@ -186,7 +186,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery; a pilot's decision ends that, a set-point does not."""
+        """Whether it returns or lands because of a low battery. A pilot's decision ends this; a set-point doesn't."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
@@ -219,12 +219,12 @@ class FailsafeLadder:
         self._wanted, self.given_up = None, True
 
     def order_landing(self) -> None:
-        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted."""
+        """Land because the proxy is about to end. From now on, accept only landings and emergency stops."""
         self._closing = True
         self.barred = "closing"
 
     def attempted(self, taken: bool) -> None:
-        """Record whether the driver accepted the last :class:`FailsafeAction`; if not, retry after ``retry_s``."""
+        """Record whether the driver accepted the last :class:`FailsafeAction`. If not, retry after ``retry_s``."""
         self._taken = taken
 
     def _battery(self, inputs: FailsafeInputs) -> list[Effect]:

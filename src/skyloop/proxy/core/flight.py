@@ -2,7 +2,7 @@
 
 The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
 mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
-it, never because of time alone. ``docs/proxy.md`` describes the rules.
+that it is, never just because time has passed. ``docs/proxy.md`` describes the rules.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from skyloop.messages import (
 
 #: A requested take-off that has no visible effect within this time is no longer ours; drivers give up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
-#: If the vehicle rises in spite of a cancelled take-off, it does so within this time.
+#: If the vehicle takes off although the take-off was cancelled, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over after this time on the ground, so that bounces and brief false reports don't end it.
+#: A flight is over after this time on the ground. Shorter bounces and brief false reports therefore don't end it.
 STANDING_NS: Final = nanoseconds(1.0)
-#: How long a flight that can't be observed counts as this proxy's; after that, it may be a different one.
+#: How long a flight that can't be observed still counts as this proxy's. After that, it may be a different flight.
 BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
-AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this [m]
+AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this height [m]
 STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent that makes no progress has reached the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
@@ -62,7 +62,7 @@ class Changed(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """The known state of the vehicle for one decision, read once and passed on."""
+    """The known state of the vehicle for one decision. It is read once and passed on."""
 
     now_ns: int
     state: FlightState
@@ -84,24 +84,24 @@ class Flight:
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
         self.left_to = ""  #: what others made the vehicle do, as the driver reports it
-        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air counts as an old run's
+        self._believed_until_ns: int | None = None  # until then, a vehicle in the air is assumed to be on an old flight
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
-        self._grounded_ns: int | None = None  # start of the current period on the ground
+        self._grounded_ns: int | None = None  # start of the current period of time on the ground
         self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
-        self._begun_ns = 0  # when the steered task began
+        self._begun_ns = 0  # time at which the steered task began
         self._was_up = False  # whether the vehicle has reported being in the air while steered
         self._landed_ns: int | None = None  # when it first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
-        self._blind_ns: int | None = None  # when a landing lost its sensor data
+        self._blind_ns: int | None = None  # time at which a landing lost its sensor data
         self._sent_up = False  # whether the newest action makes the vehicle fly
         self._seen_up = False  # whether it has been seen in the air, and not on the ground since
 
     # Does it fly? ------------------------------------------------------------------------------------------------
 
     def state(self, reported: FlightState) -> FlightState:
-        """Return the flight state, given the one reported by the driver. Thread-safe."""
+        """Return the flight state, given the state reported by the driver. Thread-safe."""
         state = self._state
         if reported is FlightState.EMERGENCY:
             return reported
@@ -118,7 +118,7 @@ class Flight:
     def flies(self, state: FlightState) -> bool:
         """Return whether the vehicle flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
 
-        In an unknown state, it counts as flying if it was seen flying or has been commanded to fly.
+        In an unknown state, the vehicle counts as flying if it was seen flying or has been commanded to fly.
         """
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
@@ -144,7 +144,7 @@ class Flight:
 
     @property
     def awaited(self) -> bool:
-        """Whether a flight from an earlier run may still turn up."""
+        """Whether a flight from an earlier run may still be discovered."""
         return self._believed_until_ns is not None
 
     def began_before(self, until_ns: int) -> None:
@@ -186,8 +186,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        ``left_to``: what others have made the vehicle do since we last steered, according to the driver. ``feedback``:
-        the newest sample, if it is fresh and the link is up; otherwise None.
+        ``left_to``: what others have made the vehicle do since the proxy last steered it, according to the driver.
+        ``feedback``: the newest sample, if it is fresh and the link is up; otherwise None.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._observe_unsteered(reported, left_to, feedback.altitude_m)
@@ -233,7 +233,7 @@ class Flight:
 
     def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver has said who took over, the flight is over, or no one else can fly the vehicle
+            return ""  # the driver has reported who took over, the flight has ended, or no one else can fly the vehicle
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
@@ -254,7 +254,7 @@ class Flight:
         self._start_descent(now_ns)
 
     def let_go(self, action_name: str) -> None:
-        """Record that the vehicle itself is now executing an action."""
+        """Record that the vehicle is now executing an action by itself."""
         self._steered = False
         if action_name == "emergency_stop":
             self._state = FlightState.EMERGENCY
@@ -275,9 +275,9 @@ class Flight:
         return not self._has_no_notion or self._was_up or reported is not FlightState.LANDED
 
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
-        """Return whether the steered task has ended on the ground, so that the vehicle is no longer steered.
+        """Return whether the steered task has ended on the ground, in which case the vehicle is no longer steered.
 
-        If the vehicle reports its state, that report counts. Otherwise, a descent has reached the ground when the
+        If the vehicle reports its state, that report decides. Otherwise, a descent has reached the ground when the
         altimeter reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and
         its result is unknown. ``feedback``: as in :meth:`observe`.
         """
@@ -287,7 +287,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # The vehicle may be about to rise, so reports from before the command prove nothing.
+            # The vehicle may be about to take off, so reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

@@ -1,13 +1,13 @@
-"""Estimate the stream rate that a path can carry from a subscriber's acknowledgements. Pure: time is an argument.
+"""Estimate the stream rate that a path can carry, based on a subscriber's acknowledgements. Pure: time is an argument.
 
 Low delay has priority. The part of a frame's round trip beyond the shortest recent one counts as waiting in the path.
 If there is a standing queue, the rate falls below the delivery rate (as in Cardwell et al., "BBR: Congestion-Based
 Congestion Control", ACM Queue 14(5), 2016). A mobile network may carry ten times as much in one tenth of a second as in
-the next, so close to its average rate, frames are often late. Each late frame also reduces the rate, which then
-grows so slowly that few are late. No frame is started while more is in flight than the path delivers in
-:data:`MOST_WAIT_S`, so that a stalled path holds a few frames rather than seconds of them, and no encoded frame has
-to be dropped. While the path is stalled, single frames are sent at increasing intervals, because anything queued
-delays the first fresh frame, which is sent as soon as an acknowledgement arrives.
+the next. When the rate is close to the network's average, frames are therefore often late. Each late frame also reduces
+the rate, which then grows so slowly that few are late. No frame is started while more is in flight than the path
+delivers in :data:`MOST_WAIT_S`. A stalled path therefore holds a few frames rather than seconds of them, and no encoded
+frame has to be dropped. While the path is stalled, single frames are sent at increasing intervals, because anything
+queued delays the first fresh frame, which is sent as soon as an acknowledgement arrives.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 
 LEAST_KBIT_S: Final = 60
-#: The initial rate. Single late frames reduce the rate no further: for most of their wait, the path carries nothing, so
-#: this would help little.
+#: The initial rate. Isolated late frames do not reduce the rate further: the path is idle for most of the wait, so a
+#: lower rate would hardly help.
 START_KBIT_S: Final = 300
 STANDING_S: Final = 0.25  #: the shortest wait within this time is due to a standing queue …
 LONG_WAIT_S: Final = 0.06  #: … and if it is longer than this, the rate falls …
@@ -28,9 +28,9 @@ FALL: Final = 0.85  #: … to this fraction of the delivery rate …
 GOOD_WAIT_S: Final = 0.03  #: … and if it is shorter than this, the rate grows
 LATE_S: Final = 0.1  #: a single frame that has waited this long is late …
 LATE_FALL: Final = 0.7  #: … and the rate falls to this fraction …
-LATE_EVERY_S: Final = 0.15  #: … once for all frames that were delayed together within this time
+LATE_EVERY_S: Final = 0.15  #: … only once for all frames that were delayed together within this time
 GROWTH_1_S: Final = 0.1  #: growth of the rate per second …
-SEARCH_1_S: Final = 2.0  #: … and the growth below the initial rate, or as long as nothing has been late
+SEARCH_1_S: Final = 2.0  #: … and growth when the rate is below the initial rate, or while no frame has been late
 MOST_WAIT_S: Final = 0.08  #: maximum delivery time of the frames in flight, beyond the shortest round trip
 SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled, which the rate did not cause …
 SILENT_FALL: Final = 0.5  #: … but the rate is reduced by this factor, because it is uncertain after the stall
@@ -38,7 +38,7 @@ PROBE_S: Final = 0.15  #: while frames wait, one is sent this often unless more 
 PROBES_S: Final = 0.1  #: … this time; during silence, one is sent …
 SELDOM: Final = 1 / 3  #: … after this fraction of the silence so far …
 SELDOM_S: Final = 0.5  #: … or after this time, if it is shorter
-LOST_S: Final = 1.0  #: frames that are not acknowledged within this time count as lost
+LOST_S: Final = 1.0  #: frames without an acknowledgement after this time count as lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip remains valid
 _FEWEST: Final = 3  # number of frames needed to judge a queue
 
@@ -51,7 +51,7 @@ class _Sent:
 
 
 class StreamRate:
-    """The rate of one stream to one subscriber, limited to ``most_kbit_s``. Not thread-safe."""
+    """The rate of one stream to one subscriber. It never exceeds ``most_kbit_s``. Not thread-safe."""
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the current rate
@@ -139,7 +139,7 @@ class StreamRate:
             _, since_ns, before = waits[0]
             delivered_kbit_s = (self._delivered - before) * 8e-3 / max(seconds(now_ns - since_ns), 0.001)
             self._fall(FALL * delivered_kbit_s)
-            waits.clear()  # measure again from here
+            waits.clear()  # start measuring again from here
         elif wait_s > LATE_S:
             if now_ns - self._late_ns >= nanoseconds(LATE_EVERY_S):
                 self._late_ns = now_ns
@@ -149,7 +149,7 @@ class StreamRate:
             self.kbit_s = min(self.kbit_s * (1.0 + growth_1_s * step_s), self._most_kbit_s)
 
     def forget(self) -> None:
-        """Forget the frames in flight, which will not be acknowledged."""
+        """Forget the frames in flight, because they will not be acknowledged."""
         self._under_way.clear()
         self._waits.clear()
         self._bytes = self._quiet_ns = 0
@@ -161,7 +161,7 @@ class StreamRate:
             self._fall(SILENT_FALL * self.kbit_s)
 
     def _fall(self, kbit_s: float) -> None:
-        """Reduce the rate, never below the minimum."""
+        """Reduce the rate, but not below the minimum."""
         self._searches = False
         self.kbit_s = min(self.kbit_s, max(kbit_s, LEAST_KBIT_S))
 

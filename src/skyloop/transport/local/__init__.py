@@ -1,8 +1,8 @@
 """The transport within one host: a Unix ``SOCK_SEQPACKET`` connection per application, and sealed shared memory.
 
-The kernel keeps packets whole, reports at once when the other end dies, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later; on other systems, no proxies are listed, and using anything else here
-raises :class:`UnsupportedError`.
+The kernel keeps packets whole, reports the death of the other end at once, checks who may connect, and leaves nothing
+behind after a crash. It needs Linux 5.1 or later. On other systems, no proxies are listed, and any other use of this
+package raises :class:`UnsupportedError`.
 """
 
 from __future__ import annotations

@@ -24,11 +24,11 @@ from skyloop.transport.local import packets
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
-_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's
+_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's packet
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
-_RETRY_S: Final = 0.25  # interval of retries for packets that did not fit into a full socket
+_RETRY_S: Final = 0.25  # interval between retries for packets that did not fit into a full socket
 _CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over if nothing arrives
-_STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread has returned with its sample
+_STAND_BY_S: Final = 0.002  # how long no other thread receives after the leading thread has returned with its sample
 _MAX_CAPACITY: Final = 1 << 31  # maximum memory that a client maps for a server
 _log = logging.getLogger(__name__)
 
@@ -52,17 +52,17 @@ class LocalClient(TransportClient):
         self._closing = False
         self._reason = ""
         self._turn = threading.Lock()
-        self._receiver = 0  # identity of the thread that holds the turn
-        self._ended = ""  # why receiving has ended; empty if it has not
-        self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to lead
-        self._releases: deque[bytes] = deque()  # packets that release frames dropped during a delivery
+        self._receiver = 0  # identity of the thread that holds ``_turn``
+        self._ended = ""  # readable reason why receiving has ended; empty while it continues
+        self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to start receiving
+        self._releases: deque[bytes] = deque()  # packets that release frames that were dropped during a delivery
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Drop a forked child's copy of the connection, without a shutdown, which would end the parent's, too."""
+        """Close a forked child's copy of the connection. A shutdown would also end the parent's connection."""
         sock, self._socket = self._socket, None
         self._ended = "the connection belongs to the parent process"
         if sock is not None:
@@ -174,7 +174,7 @@ class LocalClient(TransportClient):
             _log.exception("the handler of %s failed in closed()", self._address)
 
     def _stand_by(self) -> None:
-        """Wait until no thread leads."""
+        """Wait until no thread is receiving for itself."""
         while not self._ended:
             time.sleep(_STAND_BY_S)
             if not self._turn.locked():
@@ -228,7 +228,7 @@ class LocalClient(TransportClient):
                     except (DecodeError, LinkError, OSError) as error:
                         return f"the proxy violates the protocol: {error}"
                     deliver_frame(header, pixels)
-                    del pixels  # otherwise their slot would stay leased until the next packet
+                    del pixels  # otherwise the frame's slot would stay leased until the next packet
                 else:
                     deliver(packet)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
@@ -262,7 +262,7 @@ class LocalClient(TransportClient):
             self._unsent.append(self._releases.popleft())
         try:
             while self._unsent:
-                # It stays in the queue until sent, so that later packets can't overtake it.
+                # The packet stays in the queue until it is sent, so that later packets can't overtake it.
                 sock.send(self._unsent[0], SEND_FLAGS)
                 self._unsent.popleft()
         except OSError:
@@ -279,7 +279,7 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """A client's view of one slot, which is mapped once and read-only."""
+    """A client's view of one slot. The slot is mapped once and is read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
@@ -329,8 +329,8 @@ class Lease:
 class Leases:
     """A client's slots. The garbage collector may call :meth:`released` on any thread at any point."""
 
-    #: Number of a camera's frames that an application may hold in place. Further ones are copied, so that an
-    #: application that collects frames does not exhaust the server's limit and starve itself.
+    #: Number of a camera's frames that an application may hold in place. Further frames are copied, so that an
+    #: application that collects frames does not use up all slots of the server and starve itself.
     IN_PLACE: Final = 3
 
     def __init__(self, send_release: Callable[[int], None]) -> None:
@@ -351,14 +351,14 @@ class Leases:
     def end(self) -> None:
         """Forget all slots at the end of the connection; frames that the application still holds stay valid.
 
-        Those frames refer to this object, and the garbage collector does not search arrays for cycles. So a reference
-        from here to the client, its handler and the frames that it keeps would keep all of them alive forever.
+        Those frames refer to this object, and the garbage collector does not search arrays for cycles. A reference from
+        here to the client, its handler and the frames that it stores would therefore keep all of them alive forever.
         """
         self._slots.clear()
         self._send_release = lambda _: None
 
     def pixels(self, number: int, size: int) -> Pixels:
-        """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames."""
+        """Return a slot's frame: in place, or as a copy if the application already holds :attr:`IN_PLACE` frames."""
         slot = self._slots.get(number)
         if slot is None or not 0 <= size <= slot.capacity:
             raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")

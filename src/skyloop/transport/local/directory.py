@@ -1,14 +1,14 @@
 """The directory of sockets, in which proxies are found by name, and its access rules.
 
-Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter. It is given
-by the variable ``SKYLOOP_RUNTIME_DIR``; the default is ``skyloop`` in the user's runtime directory. A process that
-changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is on the
-directory itself or, if a group may read the directory, on the file ``.lock`` in it, which only the owner can open, so
-that members of the group can't block a proxy. Reading needs no lock.
+Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
+The variable ``SKYLOOP_RUNTIME_DIR`` sets it. The default is ``skyloop`` in the user's runtime directory. A
+process that changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is
+on the directory itself or, if a group may read the directory, on the file ``.lock`` in it, which only the owner can
+open, so that members of the group can't block a proxy. Reading needs no lock.
 
 The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket reveals whether a
-process is still listening: the kernel answers at once, without the owner noticing, with ``EPROTOTYPE`` for a live
-socket and ``ECONNREFUSED`` for a dead one.
+process is still listening. The kernel answers at once, without the owner noticing: ``EPROTOTYPE`` for a live socket and
+``ECONNREFUSED`` for a dead one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
 PROXY: Final = "proxy"
-HOST: Final = "host"  #: a host for many proxies, whose socket accepts requests to add and remove vehicles
+HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
 _OPEN_TO_OTHERS: Final = 0o027  # permissions: writable by the group, or any access for others
@@ -81,7 +81,7 @@ class Directory:
         self.check()
 
     def check(self) -> None:
-        """Check that no other user can put a socket here; ``FileNotFoundError`` if there is no such directory."""
+        """Check that no other user can put a socket here; ``FileNotFoundError`` if the directory does not exist."""
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
         if not stat.S_ISDIR(here.st_mode):
             raise LinkError(f"{self.path} is not a directory: remove it, or set {DIRECTORY_VARIABLE} to another one")
@@ -123,9 +123,9 @@ class Directory:
     def _remove_stale(self, path: Path) -> None:
         """Remove the socket of a killed proxy, unless the lock is held, because a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
-            return  # members of a group may read the directory, but not remove anything
+            return  # members of a group may read the directory, but can't remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
-            if not is_live(path):  # a proxy may have taken the name since
+            if not is_live(path):  # a new proxy may have taken the name since then
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
@@ -180,7 +180,7 @@ class Directory:
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return this user's directory, or the one shared by a group (``SKYLOOP_GROUP``), without touching any file."""
+    """Return this user's directory, or the one that a group shares (``SKYLOOP_GROUP``). It touches no files."""
     group = group or os.environ.get(GROUP_VARIABLE) or None
     configured = os.environ.get(DIRECTORY_VARIABLE)
     if group is not None and not configured:
@@ -203,13 +203,13 @@ def _default_path() -> Path:
     import platformdirs
 
     with warnings.catch_warnings():
-        # Ignore the warning about a missing ``XDG_RUNTIME_DIR``, because the safety of the fallback is checked here.
+        # Ignore the warning about a missing XDG_RUNTIME_DIR: the safety of the fallback directory is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 
 
 def is_live(path: Path) -> bool:
-    """Return whether a process holds the socket at this path."""
+    """Return whether a process still holds the socket at this path."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         code = probe.connect_ex(os.fspath(path))
     return code not in (errno.ECONNREFUSED, errno.ENOENT)
@@ -242,7 +242,7 @@ def directory_owner(path: Path) -> int | None:
 
 
 def owner_pid(path: Path) -> int | None:
-    """Return the id of the process listening at this path; None if it can't be determined at once."""
+    """Return the id of the process that listens at this path; None if it can't be determined immediately."""
     probe = Socket()
     probe.setblocking(False)
     try:

@@ -1,8 +1,8 @@
 """Manage the server's frame slots: which are free, which clients hold them, and which viewers await a frame.
 
 A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
-:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. The
-slots never run out, because each viewer can hold only a limited number.
+:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. There
+is always a free slot, because each viewer can hold only a limited number of slots.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 
-MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, in transit or in use
+MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, including frames in transit
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
 # Once the server has mapped the memory, it keeps that writeable view; no other can be created, and the size can't be
 # changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
@@ -71,7 +71,7 @@ _Newest = tuple[SlotMemory, bytes]
 
 
 class Connection(Protocol):
-    """A viewer's connection; both methods raise ``OSError`` if the packet can't be sent now."""
+    """A viewer's connection. Both methods raise ``OSError`` if the packet can't be sent now."""
 
     def transmit(self, packet: bytes) -> None: ...
 
@@ -86,7 +86,7 @@ class Viewer:
     leases: dict[int, SlotMemory] = field(default_factory=dict)
     announced: set[int] = field(default_factory=set)
     retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
-    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some
+    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some of them
     waits: bool = False  #: whether the viewer was skipped and is waiting for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
@@ -128,7 +128,7 @@ class Camera:
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
-        """Return a slot to write a frame to; the writer holds it until :meth:`offer`. ``OSError``: out of memory."""
+        """Return a slot for a frame. The writer holds the slot until :meth:`offer`. ``OSError``: out of memory."""
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
             # The size of compressed frames varies, so when one outgrows its slots, new slots get some spare room.
@@ -137,7 +137,7 @@ class Camera:
             self._geometry = geometry
             self._capacity = 1 << (header.size - 1).bit_length() if grows else max(header.size, 1)
         if self._free:
-            slot = self._free.pop()  # the one freed last is likely still in the processor's cache
+            slot = self._free.pop()  # the slot freed last is probably still in the processor's cache
         else:
             slot = SlotMemory(next(self._slot_numbers), self._generation, self._capacity)
             self._next_number = slot.number + 1
@@ -146,7 +146,7 @@ class Camera:
         return slot
 
     def offer(self, slot: SlotMemory, packet: bytes) -> int:
-        """Send a slot from :meth:`take` to all viewers; return the number of those skipped."""
+        """Send a slot from :meth:`take` to all viewers; return the number of viewers that were skipped."""
         missed = 0
         for viewer in self.active:
             if not viewer.hand(slot, packet, self.number):
@@ -205,7 +205,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Free the memory of every slot: at once if it is free, otherwise as soon as it is released."""
+        """Free the memory of every slot: immediately if the slot is free, otherwise as soon as it is released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -224,7 +224,7 @@ class Camera:
 
 
 class FrameExchange:
-    """Manages all cameras of a server. Thread-safe; frames are copied outside its lock."""
+    """Manages all cameras of a server. Thread-safe. Frames are copied while its lock is not held."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -263,7 +263,7 @@ class FrameExchange:
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:
-        """Take a slot back from a client; return False if the client did not hold it."""
+        """Take a slot back from a client; return False if the client did not hold the slot."""
         with self._lock:
             for camera in self._cameras.values():
                 viewer = camera.viewers.get(connection)
@@ -276,5 +276,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # recreated for the next viewer, because unused names must not accumulate
+                if not camera.viewers:  # recreated for the next viewer; otherwise unused names would accumulate
                     del self._cameras[name]

@@ -1,11 +1,11 @@
 """One thread that receives for many local transport servers, which can leave it if one of them blocks it.
 
 A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call fewer, which is
-better for one vehicle. With a hundred vehicles, there would be two hundred threads waking one another. Here, one thread
+better for one vehicle. With a hundred vehicles, however, two hundred threads would wake one another. Here, one thread
 waits for all connections (epoll), reads all available packets, and handles one packet of each connection in turn.
-Landings and stops come first, then set-points, then the rest, but each class gets some turns even if others are busy.
+Landings and stops come first, then set-points, then all others. Each class gets some turns even if others are busy.
 
-Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server and :attr:`Reactor.entries`
+Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server. :attr:`Reactor.entries`
 counts the calls, so that a watchdog can detect a call that does not return. It then calls :meth:`Reactor.split`, which
 leaves this thread to that server and moves all others to a new reactor.
 """
@@ -30,7 +30,7 @@ from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
 CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
-_PAUSE_S: Final = 100e-6  # a wait this long means that nothing was pending
+_PAUSE_S: Final = 100e-6  # if a wait took this long, no packet was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
 #: Order of the lanes, turn by turn: even if something is always urgent, the others each get one turn in four.
@@ -68,7 +68,7 @@ class Reactor:
     """Receives for transport servers on one thread, from construction to :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: SharedLocalServer | None = None  #: the server whose handler is, or may be, running
+        self.inside: SharedLocalServer | None = None  #: the server whose handler is running, or may be running
         self.entries = 0  #: number of times that :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -89,7 +89,7 @@ class Reactor:
             self._epoll.register(source.fileno, select.EPOLLIN)
 
     def remove(self, source: Source) -> bool:
-        """Stop waiting for a socket; return whether this reactor waited for it. Thread-safe."""
+        """Stop waiting for a socket; return whether this reactor was waiting for it. Thread-safe."""
         with self._lock:
             if self._sources.get(source.fileno) is not source:
                 return False
@@ -100,11 +100,11 @@ class Reactor:
 
     @property
     def over(self) -> bool:
-        """Whether its thread has ended, so that nothing is received for its servers."""
+        """Whether the reactor's thread has ended, in which case nothing is received for its servers."""
         return not self._thread.is_alive()
 
     def remaining_of(self, server: SharedLocalServer) -> list[Source]:
-        """Return a server's sockets left over when the thread ended; none while it runs. Thread-safe."""
+        """Return the sockets that a server left over when its thread ended; none while the thread runs. Thread-safe."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
 
@@ -114,7 +114,7 @@ class Reactor:
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to the server whose handler blocks it; return a new reactor for all others. Thread-safe.
+        """Leave this reactor to the server whose handler blocks it; return a new one for all the others. Thread-safe.
 
         No packet is lost or delivered twice, and the packets of each connection keep their order.
         """
@@ -139,7 +139,7 @@ class Reactor:
         self._wake()
 
     def close(self) -> None:
-        """End the thread after its current work. Stop its servers first. Idempotent."""
+        """End the thread after its current task. Stop its servers first. Idempotent."""
         if not self._closing:
             self._closing = True
             self._wake()
@@ -198,7 +198,7 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Queue a source for a turn in a lane; do nothing if there is no lane. Called on the reactor's thread."""
+        """Queue a source for a turn in a lane; do nothing if the lane is None. Called on the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
@@ -218,7 +218,7 @@ class Reactor:
         self.entries += 1
 
     def mute(self, source: Source) -> None:
-        """Ignore a listener until the next check, because it can't accept but would always be ready."""
+        """Ignore a listener until the next check, because it can't accept connections but would always be ready."""
         source.muted = True
         with self._lock, contextlib.suppress(OSError):
             self._epoll.modify(source.fileno, 0)
@@ -282,10 +282,10 @@ class SharedLocalServer(LocalServer):
         source.ended = True
         self.reactor.remove(source)  # a socket moving to another reactor is dropped there as soon as it is noticed
 
-    # --- the reactor's thread ---
+    # --- on the reactor's thread ---
 
     def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
-        """Accept a connection, or read a packet of one; return whether more may be waiting behind it.
+        """Accept a connection, or read a packet from one; return whether more packets may be waiting.
 
         ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
         :meth:`deliver`.
@@ -317,7 +317,7 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first waiting packet of a source from this lane; return the source's next lane."""
+        """Handle the first waiting packet of a source from this lane; return the lane that the source waits in next."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
                 return None  # the source has become more urgent and moved to that lane

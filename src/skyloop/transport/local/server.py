@@ -39,15 +39,15 @@ MAX_CLIENTS: Final = 128
 #: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
 MAX_PER_PROCESS: Final = 64
 MAX_PER_USER: Final = 64  #: maximum per user with access through a group; the proxy's own user may use all others
-PILOT_PLACES: Final = 32  #: places reserved for pilots
-HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send when they connect
+PILOT_PLACES: Final = 32  #: connections reserved for pilots
+HELLO_S: Final = 2.0  #: time limit for the first packet, which a client sends when it connects
 _RETRY_ACCEPT_S: Final = 0.2
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
 class LocalServer(TransportServer):
-    """A proxy's end, which is found on this host by its name. It can be started only once.
+    """A proxy's end of the local transport. Clients on this host find it by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
     of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature. ``group``: users who
@@ -66,7 +66,7 @@ class LocalServer(TransportServer):
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # a thread must hold it to call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # number of commands replaced by newer ones that arrived behind them
+        self._superseded = 0  # number of commands that were replaced because newer ones arrived behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -217,7 +217,7 @@ class LocalServer(TransportServer):
         return connection
 
     def _make_room(self, who: Credentials) -> str:
-        """Make room for a new connection; return why there is none, or an empty string.
+        """Make room for a new connection; return why this is impossible, or an empty string.
 
         If all places are taken, the oldest connection that has not identified itself gives way, so that such
         connections can't keep others out, however many there are.
@@ -252,7 +252,7 @@ class LocalServer(TransportServer):
         self._receivers.discard(threading.get_ident())
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
-        """Pass packets on; return why the connection ended. Re-raises the handler's errors."""
+        """Pass packets on until the connection ends; return why it ended. Re-raises the handler's errors."""
         receive, poll, lock, backlog = connection.receive, connection.poll, self._lock, connection.backlog
         while True:
             try:
@@ -302,7 +302,7 @@ class LocalServer(TransportServer):
         return ""
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
-        """Handle a connection's first packet. A process that only wants to know who is listening sends none."""
+        """Handle a connection's first packet. A process that only checks who is listening sends no packet."""
         if packet != packets.hello():
             connection.hang_up(f"its Hello is not of revision {packets.REVISION} of the local transport")
             return
@@ -312,7 +312,7 @@ class LocalServer(TransportServer):
         handler.peer_joined(connection.peer)
 
     def _control(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> bool:
-        """Handle one of the transport's own packets; return False for garbage, which the handler gets."""
+        """Handle one of the transport's own packets. Return False for garbage, which is then passed to the handler."""
         try:
             message = packets.parse(packet)
         except DecodeError:

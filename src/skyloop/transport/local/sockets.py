@@ -29,7 +29,7 @@ _MAX_OPTION: Final = 1024  # Python's limit for a socket option [bytes], enough 
 class Socket(socket.socket):
     """A ``SOCK_SEQPACKET`` socket that closes when no longer referenced.
 
-    Both ends *shut down* a connection and drop their references, but never close it, so that a descriptor's number
+    Both ends *shut down* a connection and drop their references, but neither closes it. A descriptor's number therefore
     can't be reused while a thread is sending on it.
     """
 
@@ -45,7 +45,7 @@ class Socket(socket.socket):
         self.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
-        """End the connection in both directions, after a last packet if it fits."""
+        """End the connection in both directions. A last packet is sent first if it fits into the buffer."""
         if last_packet:
             with suppress(OSError):
                 self.send(last_packet, SEND_FLAGS)
@@ -87,7 +87,7 @@ def may_connect(sock: socket.socket, gid: int | None) -> bool:
 
 @functools.lru_cache(maxsize=64)
 def user_name(uid: int) -> str:
-    """Return a user's name, or ``uid 123`` if there is none."""
+    """Return a user's name, or ``uid 123`` if the user has no name."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
@@ -114,8 +114,8 @@ class ServerConnection:
         self.poll = poll.poll  #: returns whether a packet, or the end, is waiting; for the receiving thread
         self.backlog = PacketBacklog()  #: packets taken from the socket, but not handled yet
         self.peer = peer
-        self.joined = False  #: whether the application has sent Hello, and the handler knows it
-        self.admitted = False  #: whether the application has identified itself, and the handler has admitted it
+        self.joined = False  #: whether the application has sent Hello, so that the handler knows about it
+        self.admitted = False  #: whether the application has identified itself, so that the handler has admitted it
         self.pilot = False  #: whether it connected as a pilot
         self.ending = False  #: whether the server is ending the connection, so that earlier packets no longer count
         self.reason = ""  #: why the connection ends, once either end has given a reason
@@ -139,7 +139,7 @@ class ServerConnection:
             try:
                 packet = self.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except OSError:
-                break  # the next read returns it again
+                break  # the next read returns the same packet again
             if packet == packets.WAKE:
                 continue
             superseded += backlog.put(packet)
@@ -152,7 +152,7 @@ class ServerConnection:
         set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
 
     def transmit(self, packet: bytes) -> None:
-        """Send a packet without waiting. Any thread. ``OSError``: the application has gone, or its buffer is full."""
+        """Send a packet without waiting. Any thread. ``OSError``: the application has ended, or its buffer is full."""
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
