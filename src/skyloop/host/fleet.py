@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``limits``: the proxy parameters with the same names."""
+    """``limits``: the values of the proxy parameters with the same names."""
 
     tilt: float | None = None
     climb: float | None = None
@@ -50,7 +50,7 @@ class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_f
 
 
 class Vehicle(Defaults, frozen=True, omit_defaults=True, forbid_unknown_fields=True, kw_only=True):
-    """One vehicle in the file: ``[[vehicle]]``."""
+    """One vehicle in the file (``[[vehicle]]``)."""
 
     name: Text
     address: Text
@@ -205,7 +205,7 @@ def _check_preset(place: Place, name: str, presets: dict[str, Value]) -> None:
 
 
 def _checked(place: Place, key: str, check: Any) -> Any:
-    """Return the result of ``check``; convert its exceptions to errors about the file."""
+    """Return the result of ``check``, and convert its exceptions to errors about the file."""
     try:
         return check()
     except FileFormatError:

@@ -72,7 +72,7 @@ class Host:
         self._closing = False
 
     def proxies(self) -> list[Proxy]:
-        """Return the proxies currently serving in this process. Any thread."""
+        """Return the proxies that this process is currently serving. Any thread."""
         return [proxy for vehicle in list(self.vehicles.values()) if (proxy := vehicle.proxy) is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
@@ -136,8 +136,8 @@ class Host:
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
         """Land a vehicle, end its proxy and forget it; return its last status.
 
-        Raises :class:`RefusedError` and does not remove the vehicle if it flies under a lease (code ``flown``) and
-        ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
+        Raises :class:`RefusedError`, without removing the vehicle, if the vehicle flies under a lease (code ``flown``)
+        and ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -230,7 +230,7 @@ class Host:
                 if (proxy := vehicle.proxy) is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
-            # Use one thread per vehicle: a driver that hangs must not keep another vehicle in the air.
+            # Use one thread per vehicle, because a driver that hangs must not keep another vehicle in the air.
             at_once(
                 {vehicle: partial(end, vehicle) for vehicle in vehicles},
                 tell=tell,
@@ -245,7 +245,7 @@ class Host:
     # Drivers that hang or fail -----------------------------------------------------------------------------------
 
     def _of(self, member: Any) -> SharedVehicle | None:
-        """Return the given vehicle, or the vehicle that owns the given transport server or proxy."""
+        """Return the given vehicle, or the vehicle that the given transport server or proxy belongs to."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and member in (vehicle, vehicle.server, vehicle.proxy):
                 return vehicle
@@ -274,7 +274,7 @@ class Host:
         """Give up a vehicle whose driver hangs."""
         with self._lock:
             self._loops.remove(loop)
-        loop.close()  # in case it ever returns
+        loop.close()  # in case the thread ever returns
         if (vehicle := self._of(member)) is not None:
             self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
 

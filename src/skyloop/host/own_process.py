@@ -1,7 +1,7 @@
 """A vehicle whose proxy runs in a separate process, which is restarted when it dies.
 
 The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. It ends with its
-host, immediately and without landing, just like a proxy within the host's process. Each line of its standard output
+host, immediately and without a landing, just like a proxy inside the host's process. Each line of its standard output
 is a status for the host in JSON.
 """
 
@@ -28,7 +28,7 @@ from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
 STARTS_WITHIN_S: Final = 20.0  #: time limit for the first report
-FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; doubles each time the process dies
+FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; it doubles each time the process dies
 LONGEST_PAUSE_S: Final = 30.0  #: maximum length of that pause
 #: Checks without a report, at four per second, after which the process is considered hung and killed. The watchdog
 #: counts checks rather than seconds, so that a process is not considered hung after its computer was suspended.
@@ -43,15 +43,15 @@ STATUS_EVERY_S: Final = 0.25  #: interval between reports
 
 
 def pause_s(deaths: int) -> float:
-    """Return the pause before restarting a process that has died this many times in succession [s]."""
+    """Return the pause before restarting a process that has died this many times in a row [s]."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(deaths - 1, 20)))
 
 
 class OwnProcessVehicle(HostedVehicle):
-    """A vehicle with ``process = "own"``, whose driver can harm only its own process.
+    """A vehicle with ``process = "own"``. Its driver can only harm its own process.
 
     ``announce`` is called with a line of text for users when the process dies and when it is restarted. ``command``
-    starts the process; the vehicle's name is appended, and its settings are passed separately.
+    starts the process. The vehicle's name is appended to the command, and the vehicle's settings are passed separately.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class OwnProcessVehicle(HostedVehicle):
         super().__init__(settings)
         self._announce = announce
         self._changed = threading.Condition()  # guards all of the following
-        self._reported: VehicleStatus | None = None  # status reported by the current process
+        self._reported: VehicleStatus | None = None  # the status that the current process reported
         self._silent_checks = 0  # number of checks since it last sent a report
         self._deaths = 0  # number of deaths in succession
         self._runner = RestartingChild(
@@ -174,7 +174,7 @@ class OwnProcessVehicle(HostedVehicle):
 
 
 def serve(settings: VehicleSettings) -> None:
-    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. Must run on the main thread."""
+    """Serve one vehicle until SIGTERM (which lands it first) or until the host ends. Must run on the main thread."""
     network = network_of(settings)
     driver = make_driver(settings.address)
     end: TransportServer = LocalServer(settings.name, group=settings.group)

@@ -1,7 +1,7 @@
 """The host process run by ``skyloop host fleet.toml``, and its control socket: ``add``, ``remove`` and ``status``.
 
-Each connection carries one JSON request and one answer, split into packets. The socket ``NAME.host`` is next to the
-proxies' sockets and accessible to the same users: the host's own, the superuser, and members of its group.
+Each connection carries one request and one answer in JSON, split into packets. The socket ``NAME.host`` is next to the
+proxies' sockets. The same users can access it: the host's own user, the superuser, and members of the host's group.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def serve(
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
     …`` after all have been tried. SIGINT or SIGTERM ends it. It first lands all flying vehicles, for up to
     ``land_within_s`` [s]. A second signal ends this wait. Members of ``group`` may also add and remove vehicles.
-    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced.
+    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus. The address is printed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -81,7 +81,7 @@ def serve(
         polls = _key_changes(fleet)
         gc.collect()
         gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
-        # Poll, because the kernel may deliver a signal to another thread, and that does not wake this one.
+        # Poll, because the kernel may deliver a signal to another thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -92,7 +92,7 @@ def serve(
 
 
 class Answering:
-    """Answers requests at a host's control socket; the defaults are for vehicles given only by address."""
+    """Answers requests at a host's control socket. The defaults are for vehicles that are specified only by address."""
 
     def __init__(self, host: Host, defaults: Defaults) -> None:
         self._host = host
@@ -123,7 +123,7 @@ class Answering:
 
 
 class _Lines:
-    """Prints whether a vehicle is ready, or why it waits, whenever that changes."""
+    """Prints whether a vehicle is ready, or why it is not, whenever this changes."""
 
     def __init__(self) -> None:
         self._lines: dict[HostedVehicle, LinkLines] = {}
@@ -162,7 +162,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
 
 def announce(line: str) -> None:
     """Write a line to standard output."""
-    with suppress(OSError):  # the reader is gone; continue serving
+    with suppress(OSError):  # no one reads the output; continue serving
         print(line, flush=True)
 
 
@@ -177,7 +177,7 @@ class Add(msgspec.Struct, frozen=True, tag="add"):
 
 
 class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
-    """Request to serve one more vehicle, either one from the host's file by name, or any other by address."""
+    """Request to serve one more vehicle: either a vehicle in the host's file, by name, or any other, by address."""
 
     name: str
     address: str | None = None
@@ -324,7 +324,7 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Send a request to a host; return its answer or raise its error, :class:`LinkError` or :class:`NoAnswerError`."""
+    """Send a request to a host. Return or raise its answer, or raise :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:
         directory.check()

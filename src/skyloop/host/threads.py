@@ -1,4 +1,4 @@
-"""Threads shared by many vehicles: ticks, links, requests; and a watchdog that detects loops that hang."""
+"""Threads shared by many vehicles (for ticks, links and requests), and a watchdog that detects loops that hang."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Number of rounds after which a proxy does everything again, ten times a second.
+#: Number of rounds after which a proxy does everything again. This is ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
 #: Called on the ticker's thread with the last error and the proxy whose ticks keep failing. It must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
 MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
-IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
-_IDLE_S: Final = 5.0  #: a spare thread without a job ends after this time
+IDLE_THREADS: Final = 2  #: number of threads kept ready for bursts of requests
+_IDLE_S: Final = 5.0  #: a spare thread ends after this time without a job
 
 Job = Callable[[], None]
 _LONGEST_WAIT_NS: Final = 1_000_000_000  #: maximum time to wait in the selector
-_MOST_STALE: Final = 4  #: number of queue entries per link at which stale ones are removed
+_MOST_STALE: Final = 4  #: maximum number of queue entries per link; beyond it, stale entries are removed
 CHECK_S: Final = 0.05  #: interval between checks
 STALL_CHECKS: Final = 5  #: 0.25 s: gives other vehicles a new thread before their pilots' silence makes them hover
 HANG_CHECKS: Final = 40  #: 2 s: the vehicle is dropped
@@ -43,8 +43,8 @@ HANG_CHECKS: Final = 40  #: 2 s: the vehicle is dropped
 class Ticker:
     """Ticks proxies on one thread, from construction to :meth:`close`. A failed tick does not affect other proxies.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
-    ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in succession.
+    Like a :class:`skyloop.transport.local.reactor.Reactor`, it records whose code is running and can be split.
+    ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in a row.
     """
 
     def __init__(self, on_failing: OnFailing, proxies: Iterable[Proxy] = ()) -> None:
@@ -63,7 +63,7 @@ class Ticker:
             self._failures[proxy] = 0
 
     def remove(self, proxy: Proxy) -> bool:
-        """Stop ticking a proxy; return whether it was ticked here. A tick in progress continues. Any thread."""
+        """Stop ticking a proxy; return whether this ticker was ticking it. A tick in progress continues. Any thread."""
         with self._lock:
             return self._failures.pop(proxy, None) is not None
 
@@ -126,11 +126,11 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads for the proxies' job queues: a job that hangs delays only its own queue."""
+    """A pool of daemon threads for the proxies' job queues. A job that hangs delays only its own queue."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._ready: deque[PooledJobQueue] = deque()  # queues with a job that has not been started
+        self._ready: deque[PooledJobQueue] = deque()  # queues that contain a job that has not been started
         self._idle = 0
         self._threads = 0
         self._closed = False
@@ -223,7 +223,7 @@ class SharedLoop(Protocol):
 
     @property
     def inside(self) -> Any:
-        """The object whose code is currently running, or None."""
+        """The object whose code is currently running; None if no code is."""
 
     @property
     def entries(self) -> int:
@@ -293,7 +293,7 @@ class Watchdog:
 
 
 class LinkThread:
-    """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
+    """Serves links on one thread when they are readable or due, from construction until :meth:`close`.
 
     One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
     it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
@@ -380,7 +380,7 @@ class LinkThread:
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
-            del self._due_ns[link]  # absent until it has been served
+            del self._due_ns[link]  # absent until its link has been served
             due.add(link)
         return due
 
@@ -417,7 +417,7 @@ class LinkThread:
                 return  # another thread has taken over since then
             if link in self._paused:
                 self._paused.remove(link)
-                readable = True  # it may be readable: it was not polled
+                readable = True  # it may be readable, because it was not polled
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1

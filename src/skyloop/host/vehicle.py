@@ -41,7 +41,7 @@ class Condition(StrEnum):
     STOPPED = "stopped"  #: not started yet, or removed
     STARTING = "starting"
     RUNNING = "running"
-    RESTARTING = "restarting"  #: its own process died and will restart after a pause
+    RESTARTING = "restarting"  #: its own process died and will be restarted after a pause
     FAILED = "failed"
 
 
@@ -89,7 +89,7 @@ class HostedVehicle(ABC):
     ) -> bool:
         """End the vehicle's flight and its proxy, like :meth:`skyloop.proxy.Proxy.end`. Idempotent.
 
-        Returns whether the proxy has ended; with ``unless_flying``, only if the vehicle landed in time.
+        Returns whether the proxy has ended. With ``unless_flying``, it only ends if the vehicle landed in time.
         """
 
     @property
@@ -110,9 +110,9 @@ class HostedVehicle(ABC):
 class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
-    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, and ``network`` is None for this host
-    only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's row is shown.
-    ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
+    ``reactor`` receives the proxy's local packets, ``jobs`` serves its slow requests, and ``network`` is None if it
+    serves this host only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's
+    row is shown. ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class SharedVehicle(HostedVehicle):
         return msgspec.structs.replace(row, **of_proxy(proxy))
 
     def report_stall(self, seconds: float) -> None:
-        """Publish that the driver blocks and that the vehicle no longer shares its threads."""
+        """Publish that the driver blocks, and that the vehicle no longer shares its threads."""
         proxy = self.proxy
         if proxy is not None:
             text = f"the driver has been blocking for {seconds:g} s: its vehicle no longer shares its threads"
@@ -231,7 +231,7 @@ def of_proxy(proxy: Proxy) -> dict[str, object]:
 
 
 def network_of(settings: VehicleSettings) -> FabricSettings | None:
-    """Return how a vehicle's proxy joins the network; None for this host only."""
+    """Return how a vehicle's proxy joins the network; None if it serves this host only."""
     if settings.network is None:
         return None
     from skyloop.network.config import serving

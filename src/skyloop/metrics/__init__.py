@@ -42,14 +42,14 @@ __all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # re-exported 
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
-    """Serve the metrics of the current proxies, which ``proxies`` returns for each scrape; see :func:`serve`."""
+    """Serve the metrics of the current proxies. ``proxies`` returns them for each scrape; see :func:`serve`."""
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
 
 
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics, and announces where."""
+    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics and prints where."""
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
         endpoint = serve_proxies(lambda: proxies, where)
@@ -133,6 +133,6 @@ def router_readings(session: Callable[[], Session]) -> Source:
 
 
 def _states(metric: str, labels: tuple[str, ...], current: Enum, states: type[Enum]) -> Iterator[Reading]:
-    """Yield 1 for the current state and 0 for each other."""
+    """Yield 1 for the current state and 0 for every other state."""
     for state in states:
         yield Reading(metric, float(state is current), (*labels, str(state.value)))

@@ -1,6 +1,6 @@
 """All metrics, as listed in ``docs/operations.md``, and the HTTP endpoint for Prometheus.
 
-The endpoint has its own threads, so a slow or stalled reader delays nothing else.
+The endpoint has its own threads, so a slow or stalled reader does not delay anything else.
 """
 
 from __future__ import annotations
@@ -275,7 +275,7 @@ class _Server(ThreadingHTTPServer):
         self._open: dict[Any, float] = {}  # connections, each protected until a given time; oldest first
 
     def server_bind(self) -> None:
-        # HTTPServer's own method looks up this machine's name on the network.
+        # The method of HTTPServer would look up this machine's name on the network.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -357,5 +357,5 @@ def _names_loopback(host: str) -> bool:
 
 
 def _hang_up(request: socket.socket) -> None:
-    with suppress(OSError):  # the other end is already gone
+    with suppress(OSError):  # the other end has already left
         request.shutdown(socket.SHUT_RDWR)

@@ -24,7 +24,7 @@ PER_KEY: Final = 64
 FOR_PILOTS: Final = 64
 #: Number of tokens remembered per key, because a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
-#: Total limit without keys: all applications then have the same name, and a flood looks like many applications.
+#: Total limit without keys. All applications then have the same name, so a flood from one looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 
@@ -44,7 +44,7 @@ class Admission(NamedTuple):
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join; return its terms, including the proxy's answer. Without keys, everyone is admitted."""
+    """Check a request to join. Return its terms, including the proxy's answer. Without keys, everyone is admitted."""
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
     from skyloop.network.keys.agreement import Agreement
@@ -78,7 +78,7 @@ class JoinRequest:
             self.proof = self._agreement.offer()
 
     def accept(self, welcome: packets.Welcome) -> Admission:
-        """Check the proxy's answer; return the terms. An impostor's answer raises :class:`LinkError`."""
+        """Check the proxy's answer; return the terms. An answer from an impostor raises :class:`LinkError`."""
         if not self.proof:
             return Admission()
         agreed = self._agreement.accept(welcome.proof)
@@ -104,7 +104,7 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no room for another connection from ``who``; empty if there is.
+    """Return why there is no room for another connection from ``who``; empty if there is room.
 
     ``present``: the identity behind each connection, and whether it may fly this drone.
     """
@@ -131,7 +131,7 @@ class Tokens:
         self._seen: dict[str, set[str]] = {}
 
     def add(self, who: str, connection: str) -> bool:
-        """Add a token; return False if the identity has too many."""
+        """Add a token; return False if the identity has too many tokens."""
         seen = self._seen.setdefault(who, set())
         if len(seen) >= self._most and connection not in seen:
             return False

@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return a dialer for a proxy on the network, which takes up to ``find_s`` [s] to find it.
+    """Return a dialer for a proxy on the network. It may take up to ``find_s`` [s] to find the proxy.
 
     The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
     proxy does not admit the application.
@@ -73,8 +73,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the other, but not vice versa. Such a session finds no proxy or gets no
-            # answers, and Zenoh does not notice. A new session has a new identity.
+            # One end may have forgotten the connection while the other has not, but not vice versa. Such a session
+            # finds no proxy or gets no answers, and Zenoh does not detect this. A new session has a new identity.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -109,11 +109,11 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
 
 
 class Subscription:
-    """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
+    """Sorts a topic's packets on Zenoh's threads, and delivers them on the receiving thread.
 
-    ``run``: the proxy's run; packets that others publish under its name are ignored. ``enqueue``: called with this
-    subscription, a packet (empty: a frame is due) and its number, which must be passed to :meth:`deliver` in order.
-    ``reject``: called with the reason when a packet did not come from the proxy.
+    ``run``: the proxy's run. Packets that others publish under its name are ignored. ``enqueue``: called with this
+    subscription, a packet (empty: a frame is due) and the packet's number, which must be passed to :meth:`deliver` in
+    order. ``reject``: called with the reason when a packet did not come from the proxy.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Subscription:
         self._opener = opener
         self._enqueue = enqueue
         self._reject = reject
-        #: Whether only the newest packet counts, so that packets and their acknowledgements are sent as datagrams.
+        #: Whether only the newest packet matters. Packets and their acknowledgements are then sent as datagrams.
         self.newest_wins = layout.newest_wins(topic)
         self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
         self._recent = RecentPackets()
@@ -148,11 +148,11 @@ class Subscription:
         return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
 
     def end(self) -> None:
-        """Stop delivering frames, including queued ones."""
+        """Stop delivering frames, including frames that are already queued."""
         self._ended = True
 
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
-        """Deliver the next item to the handler; return the packet that acknowledges it, empty if none is needed."""
+        """Deliver the next item to the handler. Return the packet that acknowledges it; empty if none is needed."""
         if packet:
             self._waiting -= 1
             handler.packet(packet)
@@ -207,11 +207,11 @@ _WAKE: Final[_Item] = (None, b"", 0)
 
 
 class FabricClient(TransportClient):
-    """The application's end, created by the dialer from :func:`dial`.
+    """The application's end of the transport. The dialer from :func:`dial` creates it.
 
     It releases its session when the connection ends, but not if the constructor raises :class:`UnknownNameError` (no
     such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]), :class:`LinkError` (the proxy
-    does not admit this application) or :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
+    does not admit this application) or :class:`NoAnswerError`. ``known``: the proxy's description, if received before.
     """
 
     def __init__(
@@ -231,7 +231,7 @@ class FabricClient(TransportClient):
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # the proxy's run, set once a proxy has been asked to admit us
+        self._run = ""  # the proxy's run, set once a proxy has been asked to admit this application
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
         self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each subscription with its declarations
@@ -247,7 +247,7 @@ class FabricClient(TransportClient):
         self._receiver = Receiver()  # packets for this end only
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
         self._ended = False  # nothing more can be sent
-        self._closing = False  # closed by this end: nothing more is delivered
+        self._closing = False  # this end has closed the connection: nothing more is delivered
         self._farewell = threading.Event()  # set when the proxy has answered our bye, or is gone
         self._reason = ""
         self._held: list[Any] = []
@@ -348,7 +348,7 @@ class FabricClient(TransportClient):
         return self._send_once(self._report, self._report_key, packet)
 
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost, without waiting."""
+        """Send a packet that may be lost. Never waits."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)

@@ -72,7 +72,7 @@ class FabricSettings:
     multicast: bool = True  #: discover by UDP multicast on this host's network segments
     tls: TlsFiles | None = None
     #: Silence after which a link is considered lost [s]. Peers learn this value, and applications add 0.3 s to it. A
-    #: mobile network may be silent for seconds, and need another second to deliver lost packets.
+    #: mobile network may be silent for seconds, and may need another second to deliver lost packets.
     lease_s: float = LEASE_S
     who: str = ANYONE  #: the identity, which is the certificate's common name
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
@@ -94,18 +94,18 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """Time that silence is tolerated beyond the default [s]."""
+        """Time that a silence may last beyond the default [s]."""
         return self.lease_s - LEASE_S
 
     @property
     def reach(self) -> str:
-        """Text for users that says where proxies are searched for."""
+        """Text that tells users where proxies are searched for."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 
     @property
     def identity(self) -> Identity | None:
-        """The identity of the keys; None without keys."""
+        """The identity that the keys belong to; None without keys."""
         return None if self.ring is None else self.ring.credentials.identity
 
     def __post_init__(self) -> None:
@@ -130,8 +130,8 @@ def secured(settings: FabricSettings, credentials: Credentials) -> FabricSetting
     )
 
 
-#: ``True``: discover by multicast; a string: addresses to connect to, separated by commas, plus ``multicast`` to
-#: discover as well; ``False``: this host only; ``None``: decided by the environment.
+#: ``True``: discover by multicast. A string: addresses to connect to, separated by commas, and ``multicast`` to
+#: discover as well. ``False``: this host only. ``None``: the environment decides.
 NetworkChoice = bool | str | FabricSettings | None
 
 
@@ -168,8 +168,8 @@ def serving(
 ) -> FabricSettings:
     """Return the network settings for a proxy, a host or a router.
 
-    ``network``: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
-    ``multicast=False`` forbids multicast in any case. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
+    ``network``: ``multicast``, or routers' addresses separated by commas. The list may include ``multicast`` to use
+    both. ``multicast=False`` always forbids multicast. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -204,7 +204,7 @@ def _lease_s() -> float:
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """Return these settings with the identity in the given folder."""
+    """Return these settings with the identity from the given folder."""
     from skyloop.network.keys import load  # imported only if there are keys: needs cryptography
 
     found = secured(plain, load(folder))

@@ -1,6 +1,6 @@
 """The connections of applications at a transport server, and a thread that sends to individual ones.
 
-Threads that answer an application only queue the answer here, and the sending thread never waits for an application. An
+Threads that answer an application only queue the answer here. The sending thread never waits for an application. An
 application that acknowledges nothing uses a bounded amount of memory.
 """
 
@@ -45,18 +45,18 @@ class ServerConnection:
         self.who = who
         self.id = connection
         self.admission = admission
-        self.joined_s = joined_s  #: when the application asked to join
+        self.joined_s = joined_s  #: time at which the application asked to join
         self.commands = PacketBacklog(MAX_WAITING)  #: commands that wait for the handler; the server guards this list
         self.announced = False  #: the handler was told about the application
-        self.confirmed = False  #: its token has been seen, so Zenoh will report its end
+        self.confirmed = False  #: its token has been seen, so Zenoh will report when it ends
         self.ended = False  #: further packets from the application are ignored
-        self.reason = ""  #: why the connection ends, once either end has given a reason
+        self.reason = ""  #: the reason why the connection ends, once either end has given one
         self.lock = threading.Lock()
         self.outgoing = Outgoing()  #: packets to the application
         self.receiver = Receiver()  #: packets from the application
         self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to the application
         self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
-        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number up to which it is acknowledged
+        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged frame
         self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet counts
         self.left = False  #: the application has unsubscribed from everything for good
 
@@ -66,7 +66,7 @@ class ServerConnection:
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's next packet has no room, because more than :data:`DEPTH` are unacknowledged."""
+        """Return whether a topic's next packet must wait, because more than :data:`DEPTH` are unacknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
@@ -85,7 +85,7 @@ class ServerConnection:
             return False
 
     def queue(self, packet: bytes) -> str:
-        """Keep a packet until it is acknowledged; return why there is no room for it, or an empty string."""
+        """Keep a packet until it is acknowledged. Return why there is no room for it, or an empty string."""
         with self.lock:
             if self.outgoing.put(packet):
                 return ""
@@ -97,7 +97,7 @@ class ServerConnection:
             return self.outgoing.stalled_s(now_s)
 
     def queue_own(self, packet: bytes) -> None:
-        """Queue one of the transport's own packets, which is sent only once and may be lost."""
+        """Queue one of the transport's own packets. It is sent only once and may be lost."""
         with self.lock:
             self._own.append(packet)
 
@@ -107,7 +107,7 @@ class ServerConnection:
             self._taken = max(self._taken, number)
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
-        """Return the packets to send now (number 0: the transport's own), and whether more may become due later."""
+        """Return the packets to send now (number 0: the transport's own), and whether others may become due later."""
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
@@ -118,7 +118,7 @@ class ServerConnection:
             return found, self.outgoing.under_way and not self.ended
 
 
-#: Sends a packet to an application, with number 0 if it may be lost.
+#: Sends a packet to an application. Its number is 0 if it may be lost.
 Put = Callable[[ServerConnection, bytes, int], object]
 
 
@@ -201,7 +201,7 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing.
 
-        Publishers aren't undeclared, because that fails while another thread uses one; each ends with its last user.
+        Publishers are never undeclared, because this fails while another thread uses one. Each ends with its last user.
         """
         with self._lock:
             self._session = None
@@ -210,7 +210,7 @@ class Publisher:
     def publish(self, topic: str, packet: bytes) -> int:
         """Send a packet to all subscribers of a topic; return how many subscribers are too far behind to receive it.
 
-        On a topic where only the newest packet counts, most packets are skipped while the paths to all subscribers are
+        On a topic where only the newest packet matters, most packets are skipped while the paths to all subscribers are
         stalled.
         """
         with self._lock:

@@ -21,15 +21,15 @@ from skyloop.network import packets
 DEPTH: Final = 256  #: maximum number of unacknowledged packets to one end; further packets are refused
 MAX_BYTES: Final = 1 << 20  #: size of unacknowledged packets to one end before further ones are refused [bytes]
 RECENT_PACKETS: Final = 64  #: number of recent packets that are remembered to detect repeats
-ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets …
+ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets
 #: Number of packets in flight. Zenoh queues as many per link before it drops one (``config._QUEUES``).
 ON_THE_WAY: Final = 16
 ON_THE_WAY_BYTES: Final = 1 << 18  #: total size of packets in flight [bytes]
-ACKNOWLEDGE_EVERY_S: Final = 0.15  #: and at this interval where only the newest packet counts (:class:`Pace`)
-STANDS_S: Final = 0.5  #: a path is stalled if a packet is unacknowledged for this long …
-SLOW_S: Final = 0.25  #: … and until it recovers, one packet is sent per this interval
-AGAIN_S: Final = 0.2  #: resend after this long without an answer, then after twice as long, …
-AGAIN_AT_MOST_S: Final = 0.5  #: … up to this limit
+ACKNOWLEDGE_EVERY_S: Final = 0.15  #: acknowledgement interval if only the newest packet matters (:class:`Pace`)
+STANDS_S: Final = 0.5  #: a path is stalled if a packet is unacknowledged for this long
+SLOW_S: Final = 0.25  #: interval between packets on a stalled path
+AGAIN_S: Final = 0.2  #: time before an unacknowledged packet is resent; it doubles with each attempt
+AGAIN_AT_MOST_S: Final = 0.5  #: maximum time before an unacknowledged packet is resent
 
 
 @dataclass(slots=True)
@@ -46,7 +46,7 @@ class Outgoing:
     def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
         self._depth = depth
         self._most = most_bytes
-        self._kept: deque[_Packet] = deque()  # packets in flight, followed by waiting ones
+        self._kept: deque[_Packet] = deque()  # packets in flight, followed by packets that wait
         self._bytes = 0
         self._under_way = 0  # number of packets in flight
         self._under_way_bytes = 0
@@ -57,7 +57,7 @@ class Outgoing:
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
         """Keep another packet, sent by the key ``way``, until it is acknowledged; return False if there is no room.
 
-        ``own``: it is one of the transport's own small packets, for which extra room is reserved.
+        ``own``: whether it is one of the transport's own small packets. Extra room is reserved for these.
         """
         if own:
             full = len(self._kept) >= 2 * self._depth
@@ -92,7 +92,7 @@ class Outgoing:
         return found
 
     def taken(self, number: int, now_s: float) -> None:
-        """Remove the packets acknowledged up to this number; ignore a number that has not been sent yet."""
+        """Remove the packets that are acknowledged up to this number. Ignore a number that has not been sent yet."""
         if not self._under_way or number >= self._kept[0].number + self._under_way:
             return
         while self._under_way and self._kept[0].number <= number:
@@ -144,7 +144,7 @@ class AckPolicy:
         self._next_s = -math.inf if every_s < math.inf else math.inf
 
     def count(self, number: int, size: int, now_s: float = 0.0) -> bool:
-        """Count a packet; return whether to acknowledge now."""
+        """Count a packet; return whether packets must be acknowledged now."""
         self._bytes += size
         few = number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8
         if few and now_s < self._next_s:
@@ -156,9 +156,9 @@ class AckPolicy:
 
 
 class Pace:
-    """Tracks whether the path to one subscriber carries a topic's packets. One thread sends, another acknowledges.
+    """Tracks whether the path to one subscriber delivers a topic's packets. One thread sends, another acknowledges.
 
-    A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams, which then delay all
+    A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams. They then delay all
     later packets. Few packets are therefore sent to a silent subscriber.
     """
 
@@ -190,7 +190,7 @@ class Pace:
 
 
 class RecentPackets:
-    """Remembers the latest packets: if there is a direct path and one through a router, each packet arrives twice."""
+    """Remembers the latest packets: with a direct path and one through a router, each packet arrives twice."""
 
     def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
@@ -207,7 +207,7 @@ class Receiver:
     """Receives packets at one end of a connection: numbered packets exactly once and in order, all others at most once.
 
     The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
-    other packets are passed to ``deliver``. Thread-safe; numbered packets are passed on by one thread at a time.
+    other packets are passed to ``deliver``. Thread-safe. One thread at a time passes on numbered packets.
     """
 
     def __init__(self) -> None:
@@ -224,7 +224,7 @@ class Receiver:
         control: Callable[[packets.Message], bool],
         deliver: Callable[[bytes], object],
     ) -> int:
-        """Receive a packet, to be resent if there is no room; return the number up to which all were accepted."""
+        """Receive a packet. It is resent if there is no room. Return the number up to which all were accepted."""
         with self._lock:
             if has_room():
                 for each in self._incoming.take(number, packet):

@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 #: Time that a newly opened session needs to find all nodes within reach, by multicast or at the given addresses.
 SETTLE_S: Final = 0.6
 ANSWER_S: Final = 0.5  #: time for proxies to send their descriptions
-#: Time for a linked node to list the tokens that it knows: normally milliseconds, unless it is flooded with tokens.
+#: Time for a linked node to list the tokens that it knows. It needs milliseconds unless it is flooded with tokens.
 SYNC_S: Final = 5.0
-RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three if the network was split
-SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
-YOUNG_S: Final = 1.0  #: age up to which a session needs no help with searching
-FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long
+RUNS_PER_NAME: Final = 8  #: maximum number of proxies listed per name; a split network may have two or three
+SEARCH_S: Final = 0.25  #: time to wait for answers to a search
+YOUNG_S: Final = 1.0  #: maximum age of a session that does not need help with its search
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not tried again for this long
 _POLL_S: Final = 0.05
 JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
@@ -59,7 +59,7 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
     """Return the proxies with this name, oldest first. There are several only if a network was temporarily split."""
     if not settings.multicast and not settings.connect:
-        return []  # others would have to connect to us, but we don't listen yet
+        return []  # other nodes would have to connect to this one, which does not listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
     try:
         _settle(session)
@@ -264,7 +264,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask one run of a proxy to admit a connection; return its terms."""
+    """Ask one run of a proxy to admit a connection, and return the connection's terms."""
     z, who, ring = load(), session.settings.who, session.settings.ring
     request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))
     program = Path(sys.argv[0]).name[:64]
@@ -282,7 +282,7 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
     for reply in replies:
         if reply.err is not None:
             words = reply.err.payload.to_string()[:400]
-            if words == TIMED_OUT:  # sent by a router after a time-out, so it is not a refusal
+            if words == TIMED_OUT:  # a router sent it after a time-out, so it is not a refusal
                 continue
             raise LinkError(f"the proxy {name!r} does not admit us: {words}")
         try:

@@ -24,8 +24,8 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: number of frames in flight to one reader
-#: Formats of one camera's frames. Each is encoded separately; a format split into n parts costs no more than a whole
-#: one. The default formats are not counted, which leaves room for a pilot whatever others request.
+#: The formats of one camera's frames. Each is encoded separately; a format split into n parts costs no more than a
+#: whole one. The default formats are not counted, which leaves room for a pilot whatever others request.
 MAX_FORMS: Final = 32
 MAX_FORMS_EACH: Final = 8  #: number of formats that one connection may read
 #: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
@@ -52,7 +52,7 @@ class Reader:
 
     def __init__(self) -> None:
         self._on_way: deque[tuple[int, int]] = deque()  # number and time sent
-        self.due = False  #: the newest frame should be sent to it
+        self.due = False  #: the newest frame should be sent to this viewer
         self.waits = False  #: the connection has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
@@ -107,7 +107,7 @@ class FramePublisher:
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
         """Publish a frame; return the number of readers that miss it because they have :data:`WINDOW` frames in flight.
 
-        If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
+        If the camera has readers, copy the pixels. The camera's thread then encodes and sends them.
         """
         variants = self._variants.get(header.camera)
         if not variants:
@@ -232,7 +232,7 @@ class FramePublisher:
                 del self._variants[camera]
                 self._changed.notify_all()
 
-    # --- a camera's thread ---
+    # --- on a camera's thread ---
 
     def _run(self, camera: str) -> None:
         while (work := self._next(camera)) is not None:

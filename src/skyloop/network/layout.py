@@ -1,6 +1,6 @@
 """The keys of the fabric transport: the key for each packet, and the keys that each role may use. Pure functions.
 
-A packet that requests something must travel by the matching key, so controlling keys means controlling actions.
+A packet that requests something must travel by the matching key. Controlling keys therefore means controlling actions.
 
 ``docs/wire-format.md`` contains the table. NAME is a proxy's name. WHO is an application's identity: the common name of
 its certificate, or ``anyone`` without keys. ID is a connection (16 random hexadecimal digits). TOPIC, CAMERA and
@@ -39,12 +39,12 @@ PLAIN: Final = "-"  #: the variant with a camera's unchanged frames
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
 
-# Kinds of keys for an application's packets, the kind with the weakest right first.
+# Kinds of keys for an application's packets, weakest right first.
 ASK: Final = "ask"  #: reliable; also for observers
 ORDER: Final = "order"  #: reliable; only for pilots
-COMMAND: Final = "command"  #: best effort; the command channel
+COMMAND: Final = "command"  #: best effort; the channel for commands
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: Requests that observers may send. Any other needs the right to order, so that new kinds are safe by default.
+#: Requests that observers may send. Any other kind needs the right to order, so that new kinds are safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
@@ -110,7 +110,7 @@ def video(name: str, camera: str, variant: str = "") -> str:
 
 
 def video_for(name: str, camera: str, variant: str, connection: str) -> str:
-    """Return the key for frames to one application, used while another reader of the variant can't keep up."""
+    """Return the key for frames to one application. It is used while another reader of the variant can't keep up."""
     return f"{video(name, camera, variant)}/{connection}"
 
 
@@ -154,7 +154,7 @@ def check_identity(who: str) -> None:
 def way_of(packet: bytes) -> str:
     """Return the kind of key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
 
-    Bytes that are not a packet need no rights, because nothing acts on them.
+    Bytes that are not a packet need no rights, because they have no effect.
     """
     kind = packet[5:6]
     if kind == _COMMAND:
@@ -176,7 +176,7 @@ def is_report(packet: bytes) -> bool:
 
 
 def allows(way: str, packet: bytes) -> bool:
-    """Return whether a packet is allowed on the key on which it arrived."""
+    """Return whether a packet is allowed on the key that it arrived on."""
     return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 

@@ -29,7 +29,7 @@ class FabricKind(IntEnum):
     """Kinds of packets that the transport's two ends exchange."""
 
     SUBSCRIBE = 0x50  #: application to proxy
-    TAKEN = 0x51  #: either direction: packets up to this number were received
+    TAKEN = 0x51  #: either direction: all packets up to this number were received
     SEEN = 0x52  #: application to proxy: frames up to this number were received
     BYE = 0x53  #: either direction: why the connection ends; answered with a BYE
     KEY = 0x54  #: proxy to application, sealed: the new key for topics and frames
@@ -43,7 +43,7 @@ class Subscribe(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """Acknowledges packets up to a number."""
+    """Acknowledges all packets up to a number."""
 
     topic: str  #: empty for packets sent to this end only
     number: int
@@ -57,7 +57,7 @@ class Seen(NamedTuple):
 
 
 class Bye(NamedTuple):
-    """The reason for which the connection ends."""
+    """The reason why the connection ends."""
 
     reason: str
 
@@ -101,11 +101,11 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True):
 
 
 class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
-    """A proxy's description of itself, sent as MessagePack when its ``info`` key is queried."""
+    """A proxy's description of itself. It is sent as MessagePack in reply to queries of the proxy's info key."""
 
     name: str
     run: str
-    since_ns: int  #: wall-clock time when it started [ns since 1970]; the older of two proxies keeps the name
+    since_ns: int  #: wall-clock time when the proxy started [ns since 1970]; the older of two proxies keeps the name
     host: str
     pid: int
     vehicle: str  #: the vehicle's address, e.g. ``sim://``

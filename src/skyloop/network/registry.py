@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from skyloop.network.keys import KeyRing
 
 CONFIRM_S: Final = 3.0  #: time for an admitted application to declare its token
-#: Disconnect an application that acknowledges nothing for this long. Its transport acknowledges at once, no matter how
-#: slow the application's own code is.
+#: Disconnect an application that acknowledges nothing for this long. The application's transport acknowledges at once,
+#: no matter how slow the application's own code is.
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
@@ -38,15 +38,15 @@ T = TypeVar("T")
 #: others from requesting authority.
 IN_A_ROW: Final = 16
 
-#: Items for the thread that calls the handler: a packet, True for joined, or False for left.
+#: Items for the thread that calls the handler: a packet, True if the application has joined, or False if it has left.
 Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
     """The connections of one transport server. Thread-safe, except for :meth:`check`.
 
-    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: time to wait beyond :data:`STALLED_S` before
-    disconnecting a silent application [s].
+    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: additional time to wait, beyond
+    :data:`STALLED_S`, before a silent application is disconnected [s].
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class ConnectionRegistry:
         self._left = threading.Condition()  # notified when a connection has ended
         self._last_id = 0
         self._shut: frozenset[str] = frozenset()  # identities that were excluded when the topic key was made
-        self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
+        self.dropped = 0  #: number of applications that were disconnected because they acknowledged nothing
         self.turned_away = 0  #: number of connections and tokens that were refused because of the limits
         self._away = ""  # why connections were turned away, until the handler has been notified
         self.strays = 0  #: number of samples and queries that belong to no connection
@@ -101,7 +101,7 @@ class ConnectionRegistry:
 
     @property
     def connections(self) -> list[ServerConnection]:
-        """The current connections, as a copy."""
+        """A copy of the current connections."""
         return list(self._connections.values())
 
     def of_peer(self, peer: Peer) -> ServerConnection | None:
@@ -182,7 +182,7 @@ class ConnectionRegistry:
         return admit(self._ring, self._name, self._run, sender, request, newest)
 
     def _join(self, sender: layout.Sender, request: packets.Join, admission: Admission) -> str:
-        """Admit an application; return why it was refused, or an empty string."""
+        """Admit an application. Return why it was refused, or an empty string."""
         if request.revision != packets.REVISION:
             return f"it uses revision {request.revision} of the fabric transport, this proxy {packets.REVISION}"
         with self._lock:
@@ -206,7 +206,7 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no room for another connection; without keys, only the total number is limited."""
+        """Return why there is no room for another connection. Without keys, only the total number is limited."""
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
             return f"fabric:{self._name} already has its maximum of {MAX_CLIENTS} connections" if full else ""
@@ -246,7 +246,7 @@ class ConnectionRegistry:
     def _check_keys(self) -> None:
         """End connections whose keys have been excluded or have expired.
 
-        If there were any, create a new key for published packets, so that they can no longer read them.
+        If there were any, create a new key for published packets, which the excluded applications can't read.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:
@@ -278,7 +278,7 @@ class ConnectionRegistry:
     # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that must arrive. Return False if the connection has ended or ends here. Any thread."""
+        """Send a packet that must arrive. Return False if the connection has ended, or ends now. Any thread."""
         if connection.ended:
             return False
         if problem := connection.queue(packet):
@@ -400,7 +400,7 @@ class HandlerQueue(Generic[T]):
             self._changed.notify()
 
     def get(self, timeout_s: float) -> T | None:
-        """Return the next item, or None after the time-out or if the queue is closed and empty."""
+        """Return the next item; None after the time-out, or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):

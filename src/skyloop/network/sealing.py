@@ -1,6 +1,6 @@
 """Seal packets end to end: no node between a proxy and its applications can read, change or replay them.
 
-The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
+The seal is ChaCha20-Poly1305 (RFC 8439). It also authenticates a packet's attachment and the key it travels by.
 Without keys nothing is sealed. ``docs/wire-format.md`` describes the bytes.
 """
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     import zenoh
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-TAG: Final = 16  #: bytes that sealing adds to a payload
+TAG: Final = 16  #: number of bytes that sealing adds to a payload
 _TRAILER = struct.Struct("<IQ")  # generation and number: appended to the attachment, and used as the nonce
 TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
-#: How many packets late a packet may arrive: datagrams can overtake resent packets, 100 a second for 10 s.
+#: Number of packets by which a packet may arrive late. Datagrams can overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
 GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
-#: Delay between sending a new topic key and first using it, so that it arrives before the first packet sealed with it.
+#: Delay between sending a new topic key and first using it, so that it arrives before the packets sealed with it.
 SWITCH_S: Final = 0.5
 
 
@@ -68,23 +68,23 @@ class Seal:
 
 
 class Open:
-    """Opens packets sealed by the other end's :class:`Seal`, each only once. Any thread."""
+    """Opens packets that the other end's :class:`Seal` sealed, each only once. Any thread."""
 
     tag = TAG  #: bytes that sealing adds to a payload
     trailer = TRAILER  #: number of bytes that sealing adds to an attachment
 
     def __init__(self) -> None:
         self._ciphers: dict[int, ChaCha20Poly1305] = {}
-        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only for keys that have opened an authentic packet
+        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only keys that have opened an authentic packet
 
     def use(self, key: bytes, generation: int = 0) -> Open:
-        """Also open packets sealed with this key. Only the newest :data:`GENERATIONS` keys are kept."""
+        """Also open packets that were sealed with this key. Only the newest :data:`GENERATIONS` keys are kept."""
         self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
         self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
         return self
 
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
-        """Return the packet and its attachment, or None if it is a repeat or can't be opened yet.
+        """Return the packet and its attachment; None if the packet is a repeat or can't be opened yet.
 
         Raises :class:`DecodeError` if the packet did not come from the other end.
         """

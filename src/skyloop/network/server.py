@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
 _POLL_S: Final = 0.5  # interval between checks of the connections
 _REFUSED: Final = b""  # represents a packet that was refused
-_COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
+_COMMAND: Final = b"c"  # represents a command: the first command in the connection's backlog
 _log = logging.getLogger(__name__)
 
 
@@ -149,7 +149,7 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
+        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -253,7 +253,7 @@ class FabricServer(TransportServer):
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False if it is left to the handler (garbage)."""
+        """Handle one of the transport's own packets. Return False if the handler must handle it (garbage)."""
         if isinstance(message, packets.Taken):
             if connection.took(message.topic, message.number, time.monotonic()):
                 self._sender.wake(connection)
@@ -296,7 +296,7 @@ class FabricServer(TransportServer):
                     if what is _COMMAND:
                         with self._commands_lock:
                             if not connection.commands:
-                                continue  # one command superseded two
+                                continue  # one command superseded two commands
                             what = connection.commands.get()
                     self._handle(handler, connection, what)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)

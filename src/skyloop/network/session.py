@@ -22,20 +22,20 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = 2.0  #: an unused session stays open this long for clients that reconnect
+LINGER_S: Final = 2.0  #: an unused session stays open this long in case clients reconnect
 REOPEN_S: Final = 2.0  #: time to wait for an address to become free again
 CLOSE_S: Final = 5.0  #: time that the process waits at exit for a session to close
 _BORROWED: Final = 1000  # number of retries when another thread is using the object …
 _BORROWED_S: Final = 0.001  # … and the pause between them
-#: Parts of Zenoh's error texts: positions in its source code, and what it adds to an endpoint's address.
+#: Parts of Zenoh's error texts: positions in its source code, and text that it adds to an endpoint's address.
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
 _ATTEMPTS: Final = 5  # number of attempts to get a free port before another process takes it
-Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: Zenoh's priorities in use, highest first
+Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: The Zenoh priorities that are used, highest first.
 
 
 class Session:
-    """A shared Zenoh session; give it back with :func:`release`."""
+    """A shared Zenoh session. Return it with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
@@ -48,7 +48,7 @@ class Session:
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """Wrap a function that Zenoh calls on its thread for each sample, reply or query; it must return quickly."""
+        """Wrap a function that Zenoh calls on its thread for each sample, reply or query. It must return quickly."""
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
@@ -60,7 +60,7 @@ class Session:
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
 
     def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
-        """Declare a publisher; packets are dropped if the path is congested and, with ``best_effort``, never resent."""
+        """Declare a publisher. Packets are dropped if the path is congested, and never resent with ``best_effort``."""
         z = load()
         reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
@@ -69,7 +69,7 @@ class Session:
         )
 
     def peers(self) -> set[str]:
-        """Return the common names in the certificates of all linked nodes; empty without keys."""
+        """Return the common names in the certificates of all linked nodes; an empty set without keys."""
         try:
             return {link.auth_identifier or "" for link in self.zenoh.info.links()} - {""}
         except load().ZError:  # the session is closed
@@ -100,14 +100,14 @@ class Session:
             try:
                 return zenoh_module.open(configure(sections))
             except zenoh_module.ZError as error:
-                # Another process may have taken the free port; only in that case can another attempt help.
+                # Another process may have taken the free port. Only in that case can another attempt help.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
                     raise LinkError(f"cannot join the network: {reason_of(error)}") from None
         raise AssertionError("unreachable")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the text of a Zenoh error, without positions in its source code and the internal form of endpoints."""
+    """Return the text of a Zenoh error, without positions in Zenoh's source code and the internal form of endpoints."""
     text = _PLACE.sub("", str(error))
     return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is unknown")
 
@@ -153,7 +153,7 @@ class _Pool:
             self._close(session)
 
     def retire(self, session: Session) -> None:
-        """Give new users another session from now on; this one closes once its last user has left."""
+        """Give new users another session from now on. This session closes once its last user has left."""
         with self._changed:
             session.retired = True
 
@@ -173,12 +173,12 @@ class _Pool:
             self._changed.wait_for(lambda: not self._closing, CLOSE_S)
 
     def _take_out(self, session: Session) -> None:
-        """Start closing a session, with the lock held. The caller must then call :meth:`_close`."""
+        """Start closing a session. The caller holds the lock. The caller must then call :meth:`_close`."""
         self._sessions.remove(session)
         self._closing += 1
 
     def _close(self, session: Session) -> None:
-        """Close a session outside the lock, because it may wait for the network."""
+        """Close a session outside the lock, because closing may wait for the network."""
         try:
             session.close()
         finally:
@@ -233,8 +233,8 @@ def host_name() -> str:
 def renewed(session: Session) -> Session:
     """Replace a session that has no other users with a session at the same addresses that uses the newest roster.
 
-    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
-    not become free again within :data:`REOPEN_S`.
+    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or if an address
+    does not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)
@@ -242,7 +242,7 @@ def renewed(session: Session) -> Session:
     while True:
         try:
             return acquire(settings, session.part)
-        except LinkError:  # the ports will become free in a moment
+        except LinkError:  # the ports will soon become free
             if time.monotonic() > deadline:
                 raise
             time.sleep(_BORROWED_S)
@@ -255,9 +255,9 @@ def undeclare(held: Iterable[Any]) -> None:
         for _ in range(_BORROWED):
             try:
                 each.undeclare()
-            except ended:  # the session has ended, and so have its declarations
+            except ended:  # the session has ended, and its declarations with it
                 break
-            except RuntimeError:  # "Already borrowed": another thread is sending with it
+            except RuntimeError:  # "Already borrowed": another thread is using the object to send
                 time.sleep(_BORROWED_S)
             else:
                 break

@@ -26,10 +26,10 @@ from skyloop.zones import THINNEST_M, ZONES, Space
 #: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
-REPEAT_NS: Final = NS_PER_S  #: interval at which a continuing event is published again
+REPEAT_NS: Final = NS_PER_S  #: interval at which an event that continues is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
-#: Why a hover or landing is abandoned.
+#: The reasons why a hover or landing is abandoned.
 UNHEARD: Final = f"the vehicle was silent for {seconds(BELIEF_NS):g} s and may be on another flight by now"
 _ENFORCED: Final = "enforced: the vehicle's position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is unknown"
@@ -59,7 +59,7 @@ class Counters:
 
 
 class EventPublisher:
-    """Numbers and publishes the events of one run. Thread-safe; never raises."""
+    """Numbers and publishes the events of one run. Thread-safe. Never raises."""
 
     def __init__(
         self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters, scrub: Callable[[str], str] = str
@@ -94,7 +94,7 @@ class EventPublisher:
             self._send(drafts)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
-        """Publish an event that may occur many times a second; ``make`` is called only when it is published."""
+        """Publish an event that may occur many times a second. ``make`` is called only when the event is published."""
         with self._lock:
             if self._repeats.first(key, make):
                 draft = make()
@@ -157,7 +157,7 @@ class EventDraft:
 class RepeatedEvents:
     """Decides when to publish events that may occur many times a second: the first at once, then totals once a second.
 
-    A total has the text of the newest event, because the reason for a refusal may change between repeats.
+    A total contains the text of the newest event, because the reason for a refusal may change between repeats.
     """
 
     def __init__(self) -> None:
@@ -174,12 +174,12 @@ class RepeatedEvents:
         return False
 
     def begin(self, key: Hashable, draft: Callable[[], EventDraft], now_ns: int) -> None:
-        """Record that the first event with this key, or a total, was published."""
+        """Record that the first event with this key, or its total, was published."""
         self._published[key] = (now_ns, draft)
         self._counts[key] = 0
 
     def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
-        """Return events repeated in the second since they were last published, with counts; forget the others."""
+        """Return the events repeated in the last second, with counts; forget the others."""
         due: list[tuple[EventDraft, int]] = []
         for key, (published_ns, draft) in list(self._published.items()):
             if now_ns - published_ns < REPEAT_NS:
@@ -194,7 +194,7 @@ class RepeatedEvents:
 
 
 class Episodes:
-    """Keeps track of the limits being touched, so that each is published once, not at every repeat of a set-point."""
+    """Tracks the limits that are being touched, so that each is published once, not for every repeat."""
 
     def __init__(self) -> None:
         self._touched_ns: dict[tuple[str, str], int] = {}
@@ -247,7 +247,7 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
 
 
 def given_up_event(what: str) -> EventDraft:
-    """Return the event for a hover or landing abandoned because the vehicle was silent."""
+    """Return the event for a hover or landing that was abandoned because the vehicle was silent."""
     text = f"the {what} was abandoned: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again once it is back"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
@@ -288,7 +288,7 @@ def battery_event(low: BatteryLow) -> EventDraft:
 
 
 def taken_event(name: str, action: str, others: str) -> EventDraft:
-    """Return the event for the application ``name`` taking the vehicle; ``others``: what others did with it."""
+    """Return the event for the application ``name`` taking the vehicle. ``others``: what others did with it before."""
     text = f"{name} took the vehicle by {action}: {others}"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
 
@@ -322,7 +322,7 @@ def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
 def authority_event(
     effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
 ) -> EventDraft:
-    """Return the event for one change in authority; ``holder``: the holder after all changes."""
+    """Return the event for one change in authority. ``holder``: the holder after all changes."""
     name, severity = name_of(sessions, effect.app_id), Severity.WARNING
     data: dict[str, Value] = {"app_id": effect.app_id}
     if not isinstance(effect, authority.Queued | authority.Declined):

@@ -1,4 +1,4 @@
-"""Execute actions with the driver or, if the vehicle doesn't support them, the software autopilot; fly the return.
+"""Execute actions with the driver or, for actions that the vehicle lacks, the software autopilot; fly the return.
 
 Not thread-safe: the command handler's lock is held during every call. Parameters and external poses bypass this module.
 """
@@ -52,13 +52,13 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether the path to a target must be checked, in which case the software autopilot flies there.
+        #: Whether the path to a target must be checked. If so, the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
         self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears and raises it
         self._publisher = publisher
-        self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
+        self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; cleared by the reader
 
     @property
     def state(self) -> FlightState:
@@ -108,8 +108,8 @@ class ActionExecutor:
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Execute a supported action, and return what was actually applied. Raises the driver's errors.
 
-        ``new``: whether it is an application's new request rather than a repeat. Raises :class:`RefusedError` if the
-        vehicle certainly won't follow commands in its present state.
+        ``new``: whether it is a new request of the application rather than a repeat. Raises :class:`RefusedError` if
+        the vehicle certainly won't follow commands in its present state.
         """
         autopilot = self.autopilot
         try:
@@ -162,7 +162,7 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover permanently: no further commands are sent.
+        """Hover permanently. No further commands are sent.
 
         A vehicle without a native hover is also stopped, as far as a single set-point can do that.
         """
@@ -199,7 +199,7 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start for the failsafe ladder, and provides the related feedback fields."""
+    """Flies the vehicle back to its start for the failsafe ladder, and reports this in feedback."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
         self.start: Vec3 | None = None  #: where the vehicle took off, as reported in feedback [m]
@@ -207,7 +207,7 @@ class ReturnSupervisor:
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._problem = ""  # why the ladder's return flight can't continue
+        self._problem = ""  # reason why the ladder's return flight can't continue
         self._good_ns = 0  # when the return was last able to continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:

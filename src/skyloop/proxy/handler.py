@@ -106,7 +106,7 @@ class CommandHandler(FlightSupervisor):
     # The end of a flight ----------------------------------------------------------------------------------------
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted.
+        """Land because the proxy is about to end. From now on, accept only landings and emergency stops.
 
         Returns whether the proxy has a flight, or one may be about to begin.
         """
@@ -114,12 +114,12 @@ class CommandHandler(FlightSupervisor):
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # keep withdrawing the take-off, because nothing else does so later
+                self._rising_until_ns = now_ns  # continue to withdraw the take-off, because nothing else does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering as well as it can without the proxy, which is ending."""
+        """Leave a flying vehicle hovering as well as it can without the proxy, because the proxy is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -133,7 +133,7 @@ class CommandHandler(FlightSupervisor):
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle is, or may be, flying or about to fly, and the proxy must land it. Acquires no lock."""
+        """Whether the vehicle may be flying or about to fly, so that the proxy must land it. Acquires no lock."""
         return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
@@ -150,7 +150,7 @@ class CommandHandler(FlightSupervisor):
     # The authority ----------------------------------------------------------------------------------------------
 
     def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
-        """Grant the authority or a position in the queue, or refuse the request, naming the holder."""
+        """Grant the authority or a position in the queue, or refuse the request and name the holder."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
         term_ns = None if request.for_s is None else nanoseconds(request.for_s)
@@ -224,7 +224,7 @@ class CommandHandler(FlightSupervisor):
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Return what was applied and when; for a refused command, when it was received."""
         # On a machine that was idle, as is usual before a command, each function call costs microseconds. Ordinary
-        # commands are therefore received, judged and executed here; error messages are written elsewhere.
+        # commands are therefore received, judged and executed here. Error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
@@ -259,13 +259,13 @@ class CommandHandler(FlightSupervisor):
             if intent.reason is None:  # the intent was executed
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
-        intent.action = action  # a set-point may have decayed to hover
+        intent.action = action  # a set-point that timed out may have become a hover
         automatic, fresh = command.automatic, new
         new = new and not automatic  # the library's own actions don't count as a person's decision
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may come with a substitute, a hover. If the vehicle rejects it, the old action must still end.
+            # A refusal may include a hover as a substitute. If the vehicle rejects it, the old action must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -324,7 +324,7 @@ class CommandHandler(FlightSupervisor):
             self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Execute any pilot's emergency stop, even without a lease, and however old or out of sequence."""
+        """Execute any pilot's emergency stop, even if it comes without a lease, late, or out of sequence."""
         intents, holds = session.intents, self.holds(session, command.lease)
         refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
         intents.stop(command)
@@ -339,8 +339,8 @@ class CommandHandler(FlightSupervisor):
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # repeats of a stop count as signs of life: nothing else is sent
-        self._rising_until_ns = None  # only the stop is sent
+            self.authority.last_command_ns = now_ns  # repeated stops count as signs of life: nothing else is sent
+        self._rising_until_ns = None  # only the stop request is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))

@@ -1,7 +1,7 @@
-"""Keep the parameters of a proxy and its driver in one typed store, and answer requests about them.
+"""Manage the parameters of a proxy and its driver in one typed store, and answer requests about them.
 
-Checking is a pure function (:func:`check`). If proxy and driver have a parameter with the same name, the driver's is
-shown and written, and the proxy obeys its value. An example is ``limits.tilt`` for a vehicle with a limit of its own.
+Checking is a pure function (:func:`check`). If proxy and driver have a parameter with the same name, the driver's
+is shown and written, and the proxy uses its value. An example is ``limits.tilt`` for a vehicle with its own limit.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
-    """Return the settings with new values; parts without changed parameters stay the same object.
+    """Return the settings with new values. Parts whose parameters have not changed stay the same object.
 
     ``value``: the effective values by name; ``changed``: prefixes of the changed names, such as ``limits``. Raises
     :class:`ParameterError` if the no-fly zones can't be parsed.
@@ -250,7 +250,7 @@ def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: 
 
 
 class Parameters:
-    """The store. Thread-safe; it calls the driver on the caller's thread, outside its lock."""
+    """The store. Thread-safe. The driver is called on the caller's thread, outside the lock of this object."""
 
     def __init__(
         self,
@@ -335,7 +335,7 @@ class Parameters:
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`."""
+        """Write one parameter and return its new state. ``known``: its state as just returned by :meth:`get`."""
         parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:
@@ -352,7 +352,7 @@ class Parameters:
         return written
 
     def page(self, first: int) -> ParameterPage:
-        """Return as many parameters as fit into one reply, sorted by name, starting at index ``first``."""
+        """Return as many parameters as fit into one reply, sorted by name, from index ``first`` on."""
         with self._lock:
             everything = sorted({**self._own, **self._driver}.values(), key=lambda parameter: parameter.name)
         chosen: list[Parameter] = []
@@ -389,7 +389,7 @@ class ParameterRequests:
         self._clock = clock
 
     def read_driver(self) -> None:
-        """Read the driver's parameters; keep the old ones if it raises."""
+        """Read the driver's parameters; keep the old parameters if it raises an error."""
         try:
             self._parameters.refresh()
         except Exception as error:  # noqa: BLE001  it is reported, and the flight continues

@@ -75,7 +75,7 @@ _log = logging.getLogger(__name__)
 
 
 class Proxy:
-    """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
+    """Owns a driver and its transport server, both not open yet, from :meth:`start` to :meth:`end`. A context manager.
 
     Applications connect by ``name``, which must have 1 to 64 characters. ``clock`` gives the time of all samples [ns].
     With ``ticker=False``, the caller must call :meth:`tick`, for example for many proxies in one process or in
@@ -121,7 +121,7 @@ class Proxy:
             clock=clock,
             capabilities=self.capabilities,
             state_of=flight.state,
-            # Read the driver's parameters again now that the vehicle answers.
+            # Read the driver's parameters again, because the vehicle answers now.
             on_link_up=lambda: self._requests.call_later(self._parameter_requests.read_driver),
             scrub=driver.uri.scrub,
         )
@@ -176,12 +176,12 @@ class Proxy:
         self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write an audit trail; it is closed when the proxy ends. Call before :meth:`start`."""
+        """Write an audit trail. It is closed when the proxy ends. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
 
     def keep_record(self, record: FlightRecord) -> None:
-        """Record the proxy's flight in this file, and end a flight recorded there. Call before :meth:`start`."""
+        """Record the flight in this file, and end a flight that is recorded there. Call before :meth:`start`."""
         self._record = record
         self.handler.on_ownership = record.set
 
@@ -234,8 +234,8 @@ class Proxy:
         """End the flight, then the proxy, and release all resources. Idempotent. Must not be called by the driver.
 
         First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
-        flying. A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in
-        time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
+        flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it is
+        left hovering if it can hover without the proxy. Otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
         without the proxy is still landed, however much time has passed, because it would fall otherwise. With
@@ -261,14 +261,14 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # the steps run from last to first, even if others raise
+        with ExitStack() as steps:  # the steps run in reverse order, even if some of them raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
             steps.callback(self._abandon if hangs else self._close)
             steps.callback(self.overview.end)
             steps.callback(self.events.publish, EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-            if not hangs:  # this runs first: stop obeying and steering
+            if not hangs:  # this runs first: stop obeying commands and steering
                 steps.callback(lambda: self.handler.leave_hovering(self.clock()))
                 if self._ticker is not None and self._ticker.is_alive():
                     self._ticker.join()
@@ -293,7 +293,7 @@ class Proxy:
             steps.callback(self._requests.stop)
 
     def forked(self) -> None:
-        """Leave the vehicle and the clients to the parent process; called in a child of ``os.fork``."""
+        """Leave the vehicle and the clients to the parent process. Called in a child of ``os.fork``."""
         self.ended = True
 
     def _abandon(self) -> None:
@@ -401,7 +401,7 @@ class Proxy:
         del self._sessions[peer.id]
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
-        """Count a packet as malformed if a reason is given, and end a connection that sends too many."""
+        """Count a packet as malformed if a reason is given. End a connection that sends too many."""
         if not reason:
             return
         self._counts["packets.malformed"] += 1
@@ -423,7 +423,7 @@ class Proxy:
 
     def tick(self, now_ns: int) -> None:
         """Update all that depends on time: authority, failsafe, autopilot, events, and a silent vehicle's feedback."""
-        if self._stopping.is_set():  # a shared ticker, or one that was hanging, may tick after the end
+        if self._stopping.is_set():  # a shared ticker, or a ticker that was hanging, may still tick after the end
             return
         self.tick_flight(now_ns)
         self._end_silent(now_ns)
@@ -440,7 +440,7 @@ class Proxy:
 
     @property
     def at_rest(self) -> bool:
-        """Whether feedback already shows that the vehicle is not flying and has no pilot, so that nothing is urgent."""
+        """Whether feedback already shows that the vehicle is not flying and has no pilot. If so, nothing is urgent."""
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:

@@ -58,7 +58,7 @@ class VehiclePublisher:
     It never acquires a lock that is held while the driver is called, so a driver may call it on any thread, even from
     inside such a call.
 
-    ``state_of`` returns the flight state, given the driver's, because the software autopilot may know better.
+    ``state_of`` returns the flight state, given the driver's state, because the software autopilot may know better.
     ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
     in the vehicle's address from a text.
     """
@@ -136,12 +136,12 @@ class VehiclePublisher:
         return _replace(raw, **dict.fromkeys(wrong))
 
     def stamp(self, owner: dict[str, Any]) -> None:
-        """Set the proxy's own fields in feedback; they are published by the next tick."""
+        """Set the proxy's own fields in feedback. The next tick publishes them."""
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Set the outcome of an intent in feedback; if the intent has ended, the next tick publishes the outcome."""
+        """Set the outcome of an intent in feedback. If the intent has ended, the next tick publishes the outcome."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
@@ -289,11 +289,11 @@ class VehiclePublisher:
         return self.streams.problem(topic, request, info)
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera's frames are in use at present."""
+        """Return whether this camera's frames are currently in use."""
         return self.wanted_fps(camera) > 0.0
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames are used per second: infinity for all, 0 for none."""
+        """Return how many of this camera's frames are used per second; infinity means all of them, 0 none."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
@@ -351,7 +351,7 @@ class VehiclePublisher:
             was_up, self.link_up = self.link_up, state in _LINK_UP
             if was_up != self.link_up and (was_up or self.link_breaks):  # not counting the first time that it comes up
                 self.link_breaks += 1
-            self._published_ns = -KEEP_ALIVE_NS  # published in feedback at the next tick
+            self._published_ns = -KEEP_ALIVE_NS  # to be published in feedback at the next tick
         if same:
             return
         change = state.value if before is state else f"{before.value} → {state.value}"
@@ -365,7 +365,7 @@ class VehiclePublisher:
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Publish an event from the driver; repeated driver errors are published once a second."""
+        """Publish an event from the driver. Repeated driver errors are published once a second."""
         if kind is EventKind.DRIVER_ERROR:
             self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
         else:
@@ -379,7 +379,7 @@ class VehiclePublisher:
 
     def driver_refused(self, where: str, error: BaseException) -> str:
         """Return the text for the sender of a command that made the driver raise; also publish unexpected errors."""
-        if isinstance(error, SkyloopError):  # the vehicle's own reason
+        if isinstance(error, SkyloopError):  # the reason that the vehicle gave
             self._counts["driver.errors"] += 1
             return self._scrub(str(error))
         return self.driver_failed(where, error)

@@ -1,6 +1,6 @@
 """Relay what applications send: annotations, logs and results to subscribers, and poses to the driver.
 
-Results come from the workers of processors: :class:`WorkerRoster`, which is pure, assigns frames to them;
+Results come from the workers of processors. :class:`WorkerRoster`, a pure class, assigns frames to the workers.
 :class:`ProcessorWorkers` sends each worker its share and relays its results.
 """
 
@@ -40,9 +40,9 @@ from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
 MAX_ANNOTATION: Final = 32_768  #: number of bytes in an annotation's packet
-#: A worker that is silent for this long loses its share, because it or its host hangs.
+#: A worker that is silent for this long loses its share, because the worker or its host hangs.
 SILENT_S: Final = 1.0
-#: How far in the future a result's frame may be, because of errors in its camera's clock.
+#: How far in the future the capture time of a result's frame may be, because of errors in its camera's clock.
 MAX_AHEAD_S: Final = 1.0
 MAX_JOINED: Final = 8  #: maximum number of processors that one application may work for
 
@@ -75,7 +75,7 @@ class Relay:
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Relay a log entry to its subscribers; return why it is malformed, or an empty string."""
+        """Relay a log entry to its subscribers. Return why it is malformed, or an empty string."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:
@@ -119,7 +119,7 @@ class Relay:
 
 
 class ProcessorWorkers:
-    """Sends workers their shares, and relays results. Thread-safe."""
+    """Sends workers their shares of the frames, and relays their results. Thread-safe."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class ProcessorWorkers:
         self._sent: dict[_Key, ProcessorShare] = {}
 
     def join(self, session: Session, asked: JoinProcessor, now_ns: int) -> AnyReply:
-        """Make the application a worker, or renew it as one, and send it its share."""
+        """Make the application a worker, or renew its registration as one, and send it its share of the frames."""
         app_id = session.app_id
         with self._lock:
             before = self._roster.find(app_id, asked.processor)
@@ -159,7 +159,7 @@ class ProcessorWorkers:
         return Done()
 
     def application_left(self, session: Session) -> None:
-        """Remove an application whose connection has ended; the others get its share."""
+        """Remove an application whose connection has ended. The other workers get its share."""
         with self._lock:
             if self._sessions.pop(session.app_id, None) is None:
                 return
@@ -281,7 +281,7 @@ class WorkerRoster:
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
-        """Return another worker with that name that conflicts with this one, if any."""
+        """Return another worker with that name that conflicts with this worker, if there is one."""
         for (app, name), worker in self._workers.items():
             other = worker.asked
             alike = (other.code, other.shared) == (asked.code, asked.shared)

@@ -1,4 +1,4 @@
-"""Handle connections and their requests: each request is executed once and answered as often as it is sent.
+"""Handle connections and their requests. Each request is executed only once, but answered each time it is sent.
 
 A client repeats a request, with the same number, until it receives the answer. A repeat of a pending request is merged
 with it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state
@@ -48,20 +48,20 @@ MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat
 MAX_MESSAGE: Final = 1000  #: maximum number of characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
-#: Requests that change the proxy's state. Others may be answered again, with the state at the time of the repeat.
+#: Requests that change something. Repeats of other requests may be answered again, with the state at that time.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 _log = logging.getLogger(__name__)
 
 
 class Session:
-    """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
+    """One application's connection, from joining to leaving. ``role`` is None until the application sends Hello."""
 
     def __init__(self, peer: Peer, joined_ns: int) -> None:
         self.peer = peer
         self.joined_ns = joined_ns
         self.app_id = peer.id
-        self.name = f"application {peer.id}"  #: name of the application, preliminary until its Hello
+        self.name = f"application {peer.id}"  #: name of the application; preliminary until its Hello
         self.role: Role | None = None
         self.intents = Intents()
         self.episodes = Episodes()
@@ -71,7 +71,7 @@ class Session:
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
-        """Count a malformed packet; return whether there are too many within a second."""
+        """Count a malformed packet; return whether there were too many within a second."""
         recent = self._malformed_ns
         too_many = len(recent) == MAX_MALFORMED and now_ns - recent[0] < NS_PER_S
         recent.append(now_ns)
@@ -84,7 +84,7 @@ class Answers:
     def __init__(self) -> None:
         self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request
         self._pending: set[int] = set()
-        self._forgotten = 0  # highest request number whose answer was stored but has been dropped
+        self._forgotten = 0  # highest number of a request whose stored answer has been dropped
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
         """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
@@ -154,9 +154,9 @@ Answer = Callable[[Session, Any, int], AnyReply]
 class RequestDispatcher:
     """Answers requests on the receiving thread or the jobs thread, from :meth:`start` to :meth:`stop`.
 
-    ``immediate`` and ``deferred``: the functions for these threads, by type of the request's body. Errors raised by
-    deferred ones become refusals: ``on_failure`` gets the request's name and an unexpected error, and returns the text
-    for the requester.
+    ``immediate`` and ``deferred``: the functions for the two threads, by type of the request's body. Errors raised by
+    deferred requests become refusals. ``on_failure`` is called with the request's name and an unexpected error, and
+    returns the text for the requester.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class RequestDispatcher:
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer at once, or later on the requests thread. Called on the receiving thread."""
+        """Answer immediately, or later on the requests thread. Called on the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:

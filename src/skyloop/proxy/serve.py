@@ -25,7 +25,7 @@ from skyloop.proxy.records import AuditTrail, FlightRecord, audit_path, record_p
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
-LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
+LAND_WITHIN_S: Final = 20.0  #: maximum time that a proxy waits for its vehicle to land after a signal
 ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
 _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; a waiting message is printed only later
@@ -72,7 +72,7 @@ class LinkLines:
 
 
 class Shutdown:
-    """A request to end a process that runs proxies, and how urgent it is."""
+    """A request to end a process that runs proxies, and how urgent the request is."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
@@ -81,7 +81,7 @@ class Shutdown:
 
     def request(self, reason: str, *, hurry: bool) -> None:
         """Request that the process end. Thread-safe, also for signal handlers."""
-        if hurry or self.requested.is_set():  # a second signal means to end at once
+        if hurry or self.requested.is_set():  # a second signal ends the process immediately
             self.hurry.set()
         self.reason = self.reason or reason
         self.requested.set()
@@ -99,14 +99,14 @@ def serve(
     audit: Path | None = None,
     beside: Beside | None = None,
 ) -> None:
-    """Serve a vehicle to this host's applications under a name. Blocks; call on the main thread.
+    """Serve a vehicle to this host's applications under a name. Blocks, and must be called on the main thread.
 
     ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
     Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
-    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s];
-    a second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
+    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s].
+    A second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
     which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
     called several times a second. The updates about keys that it returns are logged and published as an event.
 
@@ -159,7 +159,7 @@ def run(
     overview = OverviewRegistry()
     for proxy in proxies:
         proxy.overview.share(overview)
-    within_s = land_within_s  # a vehicle may be found in flight as soon as its proxy starts
+    within_s = land_within_s  # a vehicle may turn out to be in flight as soon as its proxy starts
     with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as around:
         if beside is not None:
             around.enter_context(beside(proxies))
@@ -169,12 +169,12 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            # A private proxy is never restarted, and no one could fly a vehicle that it leaves in the air.
+            # A private proxy is never restarted, so no one could fly a vehicle that it leaves in the air.
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
                 within_s = max(within_s, ORPHAN_LANDS_WITHIN_S)
         lines = [_announced(proxy) for proxy in proxies]
-        # Wake periodically, because a signal delivered to another thread does not wake this one.
+        # Wake up periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
                 _log.warning("%s", change)
@@ -186,7 +186,7 @@ def run(
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail; :class:`UsageError` if it can't be written to ``path``, if given."""
+    """Give a proxy its audit trail. Raises :class:`UsageError` if a ``path`` is given that can't be written to."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -228,12 +228,12 @@ def at_once(
     """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
     ``tell``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
-    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may end before they do.
+    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may exit before they end.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
         thread = threading.Thread(target=end, name="skyloop-end", daemon=daemon)
-        with suppress(RuntimeError):  # no thread is available, so it is run below
+        with suppress(RuntimeError):  # no thread is available, so the job runs below
             thread.start()
             threads[one] = thread
     left = [one for one in ends if one not in threads]
@@ -245,7 +245,7 @@ def at_once(
     for one in left:
         ends[one]()
     for one, thread in threads.items():
-        while thread.is_alive() and not over(one):  # wake periodically to handle signals
+        while thread.is_alive() and not over(one):  # wake up periodically to handle signals
             thread.join(_POLL_S)
 
 
@@ -288,5 +288,5 @@ def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
 
 
 def _announce(line: str) -> None:
-    with suppress(OSError):  # standard output has no reader: keep serving
+    with suppress(OSError):  # no one reads standard output: continue serving
         print(line, flush=True)

@@ -1,7 +1,7 @@
 """Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
 A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
-alone; its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
+alone. Its rate and size adapt to the path, based on acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
 vehicle itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
@@ -32,12 +32,12 @@ from skyloop.transport.frame_encoding import resized_header
 MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
 KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requests for key frames
 IDLE_S: Final = 1.0  #: a stream's thread ends after this time without subscribers
-GOOD_BITS: Final = 0.2  #: bits per pixel beyond which images hardly improve
+GOOD_BITS: Final = 0.2  #: number of bits per pixel beyond which images hardly improve
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 _FPS: Final = 30.0  # assumed frame rate of cameras that do not announce one
 _BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the image, because each change costs a key frame
-#: Fraction of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
+#: Fractions of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
 #: If they overload the path, they are retried after this time. The time doubles with each failure.
@@ -123,13 +123,13 @@ class StreamForm:
                 self._rate.forget()
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
-        """Return whether to encode a frame. Call it once per frame, on the thread that publishes it."""
+        """Return whether a frame must be encoded. Call it once per frame, on the thread that publishes it."""
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
             if not subscribers or self.passing:
                 return False
-            if self._passing:  # the vehicle has stopped sending
+            if self._passing:  # the vehicle has stopped sending the stream
                 self._encode_again()
             if self._rate is not None and not self._rate.may_send(self._clock()):
                 self.skipped += 1
@@ -150,7 +150,7 @@ class StreamForm:
             self._changed.notify()
 
     def report(self, report: StreamReport, now_ns: int) -> None:
-        """Handle a subscriber's report: its newest frame, and whether it needs a key frame."""
+        """Handle a subscriber's report, which gives its newest frame and whether it needs a key frame."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
             # A number that this stream never sent would distort the measurement of the path.
@@ -167,7 +167,7 @@ class StreamForm:
                 self._passing = False
                 return None
             fits = rate.may_send(now_ns)
-            # Each frame refers to the previous one; after skipping one, encode until the vehicle's next key frame.
+            # Each frame refers to the previous one. After a skipped frame, encode until the vehicle's next key frame.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
                 if not self._wants_key:  # the stream overloaded the path
                     self._try_ns = now_ns + self._again_ns
@@ -186,7 +186,7 @@ class StreamForm:
         self._own_bytes += size
         passed_ns = now_ns - self._own_since_ns
         if passed_ns >= _MEASURE_NS:
-            # After a pause, the average would be too low, so start a new measurement instead.
+            # After a pause, the average would be too low, so a new measurement starts instead.
             if passed_ns < 2 * _MEASURE_NS:
                 self._own_kbit_s = self._own_bytes * 8e6 / passed_ns
             self._own_bytes, self._own_since_ns = 0, now_ns
@@ -320,7 +320,7 @@ class Streams(Forms[StreamForm]):
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for the streams that need it, copying it once if any do."""
+        """Queue a frame for the streams that need it. The frame is copied once if any stream does."""
         camera = header.camera
         wanted = [
             form
@@ -343,14 +343,14 @@ class Streams(Forms[StreamForm]):
                     self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
-        """Handle a subscriber's report; return why it makes no sense, or an empty string."""
+        """Handle a subscriber's report. Return why it makes no sense, or an empty string."""
         if (form := self.find(report.topic)) is not None:
             form.report(report, self._clock())
             return ""
         return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is not a stream"
 
     def publish(self, picture: EncodedFrame) -> None:
-        """Publish a frame in as many packets as it needs. Thread-safe."""
+        """Publish a frame, split into as many packets as needed. Thread-safe."""
         camera, missed = picture.camera, 0
         for piece in split(picture):
             missed = max(missed, self._publish_packet(picture.topic or f"stream/{camera}", encode(piece)))
@@ -364,7 +364,7 @@ class Streams(Forms[StreamForm]):
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
-    """Return width and height of the encoded image [px], which are even because colours have half the resolution."""
+    """Return the width and height of the image [px]. Both are even, as colours have half the resolution."""
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 

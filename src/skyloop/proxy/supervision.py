@@ -4,8 +4,8 @@ The lock is also held while the driver is called. The transport's threads delive
 authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions themselves are pure, in
 :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing called under the last two locks calls back
-into this module; a driver publishes what it receives on any thread without this lock.
+Lock order: this lock first, then the publisher's, then the events'. Nothing that is called under the last two locks
+calls back into this module. A driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ SLEEP_NS: Final = nanoseconds(0.25)
 class FlightSupervisor:
     """Supervises the authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections by application number, read here and changed by the proxy. ``slept``: returns how long
-    the computer has slept in total [ns].
+    ``sessions``: the connections by application number. They are read here, and only the proxy changes them. ``slept``:
+    returns how long the computer has slept in total [ns].
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class FlightSupervisor:
         self._clock = clock
         self._left = False  # the proxy is ending, and makes no more decisions about the flight
         self._pilot = "none"  # "held", or why the authority has no holder
-        self._breaks_seen = 0  # number of breaks of the vehicle link at the last check
+        self._breaks_seen = 0  # number of times that the vehicle link had broken at the last check
         self._heard_ns = -LATEST_NS  # time of the last tick that found the vehicle link up
         self._slept = slept
         self._slept_seen = slept()  # time the computer had slept in total at the last check
@@ -120,7 +120,7 @@ class FlightSupervisor:
         self._rising_until_ns: int | None = None
         self._drifts = False  # whether the software autopilot drifts, as last reported
         self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
-        self._episodes = Episodes()  # episodes in which limits reduced the proxy's own actions, without a pilot
+        self._episodes = Episodes()  # episodes in which limits reduced actions of the proxy itself, without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
         self._stamp()
@@ -171,8 +171,8 @@ class FlightSupervisor:
     def _observe_link(self, now_ns: int) -> None:
         """React to changes of the vehicle link since the last call.
 
-        Intents end when the link breaks and again when it returns, so that no old command is executed later. Both times
-        a hover is sent, because a driver must not continue an old set-point. A landing in progress continues.
+        Intents end when the link breaks, and again when it returns, so that no old command is executed later. A hover
+        is sent both times, because a driver must not continue an old set-point. A landing in progress continues.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -191,8 +191,8 @@ class FlightSupervisor:
     def _observe_silence(self, now_ns: int) -> None:
         """Give up a hover or landing after a long silence of the vehicle, because it may be on another flight by then.
 
-        After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
-        to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may be present.
+        After a landing by the ladder, a vehicle found in the air counts as flown by others at once, because there is
+        no pilot to claim it. Otherwise, this is decided when the vehicle answers, because its pilot may be present.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -227,7 +227,7 @@ class FlightSupervisor:
         self._start_over(Fate.SLEPT, now_ns)
 
     def _observe_position(self, now_ns: int) -> None:
-        """Update the vehicle's position; hover if it has jumped, because the request assumed the old position."""
+        """Update the vehicle's position. Hover if it has jumped, because the request was based on the old position."""
         airspace = self.checks.airspace
         airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
@@ -260,7 +260,7 @@ class FlightSupervisor:
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
             elif changed.why:  # our own flight was found, and its pilot may return: restart the silence
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
-            if changed.why and executor.supported:  # a replay has no pilot to surprise
+            if changed.why and executor.supported:  # a replay has no pilot who might be surprised
                 self._events.publish_drafts(ownership_event(changed))
         return executor.seen(now_ns)
 
@@ -291,7 +291,7 @@ class FlightSupervisor:
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
-                self._observe_vehicle(now_ns)  # others may have landed the vehicle, which would have ended the intent
+                self._observe_vehicle(now_ns)  # others may have landed the vehicle, which ends the intent
             feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
@@ -412,7 +412,7 @@ class FlightSupervisor:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._observe_vehicle(now_ns)
-        # An abandoned flight may be a different one by now, unless the software autopilot kept steering, or it lands.
+        # An abandoned flight may be a different one by now, unless the autopilot kept steering or the ladder lands.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._observe_vehicle(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
@@ -432,7 +432,7 @@ class FlightSupervisor:
         return self._apply_failsafe(effects, now_ns, stamps=stamps) if effects or stamps else []
 
     def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Execute the ladder's decisions; return the events to publish afterwards, because publishing takes time."""
+        """Execute the ladder's decisions. Return the events to publish afterwards, because publishing takes time."""
         if stamps or any(isinstance(effect, StepChange) for effect in effects):
             self._stamp()
         drafts = []

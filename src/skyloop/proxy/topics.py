@@ -47,7 +47,7 @@ _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, naming the available ones; an empty string if it can be.
+    """Return why a topic can't be subscribed to, and name the available topics; an empty string if it can.
 
     A processor's results may be subscribed to before it has a worker.
     """
@@ -95,7 +95,7 @@ class Forms(Generic[F]):
         self._lock = threading.Lock()  # guards changes to the set of known variants
 
     def find(self, topic: str) -> F | None:
-        """Return the variant of a topic; None if it was never requested."""
+        """Return the variant of a topic; None if no one has requested it."""
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
@@ -145,7 +145,7 @@ class FeedbackVariants(Forms[_Variant]):
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
-        """Publish a sample in each variant for which it is due. One thread at a time.
+        """Publish a sample in each variant that is due. Not thread-safe.
 
         ``now_ns`` must not be the capture time, which does not advance while the vehicle is silent.
         """
@@ -179,7 +179,7 @@ class OverviewRegistry:
         self._packets: list[bytes] = []
 
     def add(self, row: Callable[[], VehicleOverview]) -> None:
-        """Add a vehicle; ``row`` returns its row and is called on any proxy's ticker."""
+        """Add a vehicle. ``row`` returns the vehicle's row and is called on any proxy's ticker."""
         with self._lock:
             self._sources[row] = None
             self._made_ns = None
@@ -213,7 +213,7 @@ class OverviewPublisher:
         self._due_ns = 0
 
     def share(self, registry: OverviewRegistry) -> None:
-        """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
+        """Publish the rows of other proxies, too, and share this proxy's row. Call before :meth:`begin`.
 
         Does nothing if applications may have access to only some of the proxies, because they would see all rows.
         """

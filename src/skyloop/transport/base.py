@@ -58,7 +58,7 @@ def results(processor: str) -> str:
 
 _UINT8 = np.dtype(np.uint8)
 
-#: Bytes of a frame: shape (size,), uint8, not writeable. They stay unchanged while any view of them exists.
+#: Bytes of a frame: shape (size,), uint8, not writeable. The pixels stay unchanged while any view of them exists.
 Pixels = NDArray[np.uint8]
 
 
@@ -80,7 +80,7 @@ class ServerHandler(Protocol):
         """Handle a new connection, before its first packet. Later calls identify the peer by an equal ``Peer``."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
+        """Handle a packet from an application. It has 1 to :data:`MAX_PACKET` bytes, and its content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
         """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
@@ -95,11 +95,11 @@ class ServerHandler(Protocol):
         """Handle a request for an unknown topic, or for more topics than allowed; ``reason`` is readable text."""
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """Handle the end of a connection and its reason, once for each ``peer_joined``, after the last packet."""
+        """Handle the end of a connection. Called once for each ``peer_joined``, after the last packet."""
 
 
 class TransportServer(ABC):
-    """A proxy's side of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
+    """A proxy's end of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
@@ -133,7 +133,7 @@ class TransportServer(ABC):
         """Return the number of a topic's subscribers. If there are none, samples need not be produced."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
-        """Return why an application that has identified itself may not stay; empty if it may, which is the default.
+        """Return why an application that has identified itself must leave; empty if it may stay (the default).
 
         Some places may be reserved for pilots.
         """
@@ -141,7 +141,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def disconnect(self, peer: Peer, reason: str) -> None:
-        """End one connection; ``peer_left`` and the application get the reason. Does nothing if it is already gone."""
+        """End one connection. ``peer_left`` and the application get the reason. Does nothing if it is already gone."""
 
     @property
     def counters(self) -> dict[str, float]:
@@ -160,7 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks, called on its receiving thread, one at a time."""
+    """A transport client's callbacks. They are called on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -174,26 +174,26 @@ class ClientHandler(Protocol):
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, whichever end closed it and why. Called once, as the last callback."""
+        """Handle the end of the connection, whichever end closed it and why. Called once. It is the last callback."""
 
 
 class TransportClient(ABC):
-    """An application's side: a single connection, made by a :data:`Dialer` and not reusable once closed."""
+    """An application's end: a single connection, made by a :data:`Dialer`. It can't be reused once it is closed."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the proxy; return whether it was handed over. Any thread."""
+        """Send a packet to the proxy. Return whether it was handed over to Zenoh. Any thread."""
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic, or unsubscribe from it. Any thread.
+        """Subscribe to a topic, or end the subscription. Any thread.
 
         Raises :class:`UsageError` unless the name has 1 to :data:`MAX_TOPIC` characters.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection. Idempotent. ``closed`` runs before this returns, except on the receiving thread."""
+        """End the connection. Idempotent. ``closed`` is called before this returns, except on the receiving thread."""
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
         """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.
@@ -215,7 +215,7 @@ class TransportClient(ABC):
     def same_clock(self) -> bool:
         """Whether both ends are on one host and read the same monotonic clock. If so, the offset is zero.
 
-        An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
+        An application also checks the clock that the proxy's ``Welcome`` names: a host can have several time namespaces.
         """
 
     @property
@@ -246,7 +246,7 @@ NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
 def check_name(name: str) -> None:
-    """Raise :class:`UsageError` unless this can be the name of a proxy (:data:`NAME`)."""
+    """Raise :class:`UsageError` unless this is a valid name for a proxy (:data:`NAME`)."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "

@@ -12,7 +12,7 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, nearest first, and numbers their peers itself.
+    """One transport server that combines several, nearest first. It assigns its own numbers to their peers.
 
     The handler gets one call at a time, as the contract requires: an end that has a command goes first, the others in
     order of arrival.
@@ -25,11 +25,11 @@ class CompositeServer(TransportServer):
         self.lock = PriorityLock()  #: a thread must hold it to call the handler
         self._members: dict[
             int, tuple[TransportServer, Peer]
-        ] = {}  # by our number: the end with that application, and its peer there
+        ] = {}  # for each of our numbers, the end that the application is connected to, and its peer at that end
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start accepting connections at all ends or, if an end's ``start`` raises, at none."""
+        """Start accepting connections at all ends. If one end's ``start`` raises, no end stays started."""
         started: list[TransportServer] = []
         try:
             for end in self._ends:

@@ -39,11 +39,11 @@ from skyloop.transport.testing import (
 
 
 class TransportSuite(ABC):
-    """The contract in :mod:`skyloop.transport.base` as tests; pytest collects those that a subclass inherits."""
+    """The contract in :mod:`skyloop.transport.base` as tests. pytest collects the tests that a subclass inherits."""
 
     @abstractmethod
     def make_server(self) -> TransportServer:
-        """Return a new transport server, not yet started."""
+        """Return a new transport server that has not been started."""
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
@@ -55,7 +55,7 @@ class TransportSuite(ABC):
 
     @contextmanager
     def serving(self) -> Iterator[tuple[TransportServer, ServerLog]]:
-        """Yield a started server and the log of its handler; stop the server at the end."""
+        """Yield a started server and its handler's log, and stop the server at the end."""
         server, log = self.make_server(), ServerLog()
         server.start(log)
         try:
@@ -65,7 +65,7 @@ class TransportSuite(ABC):
 
     @contextmanager
     def connected(self, server: TransportServer, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
-        """Yield a client that has joined and subscribed; close it at the end. ``keep``: its log keeps frames."""
+        """Yield a joined, subscribed client, and close it at the end. ``keep``: its log keeps frames."""
         client_log = ClientLog(keep=keep)
         known = len(log.joined)
         before = {topic: server.subscribers(topic) for topic in topics}

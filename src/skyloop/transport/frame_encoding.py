@@ -15,10 +15,10 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
-    """Encode a frame as requested; return the header that describes the result, and its bytes.
+    """Encode a frame as requested. Return the header that describes the result, and the result's bytes.
 
     A frame that is already a JPEG is returned unchanged, regardless of the request. Raises :class:`MissingExtraError`
-    if OpenCV is needed but not installed, and :class:`LinkError` if it could not encode the frame.
+    if OpenCV is needed but not installed, and :class:`LinkError` if OpenCV could not encode the frame.
     """
     channels = _CHANNELS.get(header.encoding)
     if channels is None or (request.encoding == "raw" and request.scale == 1.0):
@@ -44,7 +44,7 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
 
 
 def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
-    """Return the header of a frame resized to these pixels, as plain pixels, with matching intrinsics."""
+    """Return the header of a frame that is resized to these pixels, as plain pixels, with matching intrinsics."""
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:

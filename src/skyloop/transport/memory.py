@@ -1,8 +1,8 @@
 """The transport within one process, for tests, and for a proxy and an application that share a process.
 
-It fulfils the whole contract of :mod:`skyloop.transport.base`, including receiving threads and bounded queues, so code
-that works with it works with other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
-and frames, identically for the same seed.
+It fulfils the whole contract of :mod:`skyloop.transport.base`, including receiving threads and bounded queues. Code
+that works with it therefore works with other transports. :class:`Faults` makes it lose, repeat, reorder and damage
+packets and frames, identically for the same seed.
 """
 
 from __future__ import annotations
@@ -121,11 +121,11 @@ class MemoryServer(TransportServer):
         return f"memory:{self._name}"
 
     def arrived(self, client: MemoryClient) -> None:
-        """Wake the receiving thread for a packet in the client's ``outgoing``."""
+        """Wake the receiving thread for a packet in the client's ``outgoing`` queue."""
         self._inbox.put((client, client.pass_on))
 
     def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
-        """Return whether a client may subscribe to a topic; if not, call the handler's ``malformed``."""
+        """Return whether a client may subscribe to a topic. If not, report a malformed request to the handler."""
         problem = self._handler.topic_problem(topic) if self._handler is not None else ""
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
@@ -174,7 +174,7 @@ class MemoryClient(TransportClient):
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
         self._ended = False  # whether either end has ended the connection, so that nothing can be sent
-        self._closing = False  # whether this end has closed the connection, so that nothing more is delivered
+        self._closing = False  # whether this end has closed the connection and therefore delivers nothing more
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:

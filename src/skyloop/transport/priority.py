@@ -37,8 +37,8 @@ def is_command(packet: bytes) -> bool:
 class Lane(IntEnum):
     """The class of the first packet in a backlog, most urgent first."""
 
-    URGENT = 0  #: commands of which at least one is not a set-point, such as a landing or an emergency stop
-    STEERING = 1  #: set-points, or keep-alives sent instead
+    URGENT = 0  #: commands that include at least one that is not a set-point, such as a landing or an emergency stop
+    STEERING = 1  #: set-points, or the keep-alives that are sent instead
     OTHERS = 2  #: anything else
 
 
@@ -59,12 +59,12 @@ class PacketBacklog:
 
     @property
     def full(self) -> bool:
-        """Whether the backlog can't take any more packets for now."""
+        """Whether the backlog currently can't take any more packets."""
         return len(self._waiting) >= self._most or self._bytes >= MOST_BYTES
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the leading commands or, if there are none, of the first packet; None if the backlog is empty."""
+        """The lane of the leading commands; without any, that of the first packet; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -131,7 +131,7 @@ def _command(packet: bytes) -> Command | None:
 class PriorityLock:
     """A re-entrant lock. Each holder hands it to the thread that waits next.
 
-    ``with lock:`` waits behind all others, ``lock.acquire(urgent=True)`` only behind other urgent waiters.
+    ``with lock`` waits behind all other threads; ``lock.acquire(urgent=True)`` waits only behind other urgent ones.
     """
 
     def __init__(self) -> None:
@@ -159,7 +159,7 @@ class PriorityLock:
         woken.acquire()  # the releasing thread has made this thread the owner
 
     def release(self, *_: object) -> None:
-        """Release the lock once, as its owner (not checked); the last release hands it over."""
+        """Release the lock once. The caller must own it (this is not checked). The last release hands the lock over."""
         if self._depth:
             self._depth -= 1
             return
@@ -169,7 +169,7 @@ class PriorityLock:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        """Give the lock to the first waiter, if it is free."""
+        """Give the lock to the first waiting thread, if the lock is free."""
         with self._queues:
             waiting = self._urgent or self._others
             if waiting and self._taken.acquire(False):

@@ -30,7 +30,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def raises(error: type[Exception], call: Callable[[], object]) -> None:
-    """Check that a call raises an error; an error of another type passes through."""
+    """Check that a call raises an error. Errors of other types pass through."""
     try:
         call()
     except error:
@@ -50,7 +50,7 @@ class ServerLog:
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
         self.refusals: list[tuple[Peer, str]] = []
-        self.problems: dict[str, str] = {}  #: why these topics can't be subscribed to
+        self.problems: dict[str, str] = {}  #: the reasons why these topics can't be subscribed to
         self.complaints: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 
@@ -94,7 +94,7 @@ class ClientLog:
         self.torn: list[int] = []
         self.closings: list[str] = []
         self.on_packet: Callable[[bytes], None] | None = None
-        self.gate = threading.Event()  #: the handler blocks here while this is not set
+        self.gate = threading.Event()  #: the handler blocks here until this is set
         self.gate.set()
 
     def packet(self, packet: bytes) -> None:
@@ -138,7 +138,7 @@ class Joined(NamedTuple):
 
 
 def resources() -> tuple[int, int]:
-    """Return the number of threads and, from ``/proc``, open descriptors of this process, after collecting garbage."""
+    """Return the number of this process's threads and (from ``/proc``) open descriptors, after garbage collection."""
     gc.collect()
     descriptors = Path("/proc/self/fd")
     return threading.active_count(), len(list(descriptors.iterdir())) if descriptors.exists() else 0

@@ -37,7 +37,7 @@ PAGE_NETWORKS: Final = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
-#: … and names that do not exist on the Internet (RFC 6762, 8375; ICANN has reserved .internal).
+#: … and names that do not exist on the Internet (RFC 6762, 8375; ICANN has reserved ``.internal``).
 PAGE_NAMES: Final = ("localhost", "local", "lan", "internal", "home.arpa")
 _URN: Final = "urn:skyloop:"
 _CURVE: Final = ec.SECP256R1()
@@ -106,8 +106,8 @@ def issue(
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
     """Create an authority for pages, separate from the lab's, that may certify only these names and names below them.
 
-    Its certificates are valid for private addresses, names on local networks, and the given names. A browser that
-    trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
+    Its certificates are valid for private addresses, names on local networks, and the names given on creation. A
+    browser that trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
     """
     permitted: list[x509.GeneralName] = [x509.IPAddress(ipaddress.ip_network(network)) for network in PAGE_NETWORKS]
     permitted += [x509.DNSName(each) for each in dict.fromkeys([*PAGE_NAMES, *names])]
@@ -156,12 +156,12 @@ def read_der(content: bytes) -> x509.Certificate:
 
 
 def der(certificate: x509.Certificate) -> bytes:
-    """Encode a certificate in DER, for sending over the network."""
+    """Encode a certificate in DER, so that it can be sent over the network."""
     return certificate.public_bytes(serialization.Encoding.DER)
 
 
 def sign(key: PrivateKey, content: bytes) -> bytes:
-    """Sign content with an identity's key: ECDSA with SHA-256, in DER."""
+    """Sign content with an identity's key. The signature is ECDSA with SHA-256, in DER."""
     return key.sign(content, _SIGNED)
 
 
@@ -181,7 +181,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
     """Decode an elliptic-curve private key that was read from a file."""
     try:
         key = serialization.load_pem_private_key(content, password=None)
-    except (ValueError, TypeError):  # TypeError is raised for an encrypted key
+    except (ValueError, TypeError):  # an encrypted key raises TypeError
         raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
         raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
@@ -189,7 +189,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's. ``key`` is None on machines that issue nothing."""
+    """Check that a certificate is one of an authority. ``key`` is None on machines that issue no certificates."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:

@@ -7,7 +7,7 @@
 ``roster.json``   all identities in the lab, signed; to be replaced by newer ones
 ================  ==============================================================================
 
-Zenoh's access control identifies subjects by common name, so all names must be known wherever it is enforced. The
+Zenoh's access control identifies subjects by common name, so every node that enforces it must know all names. The
 roster file has two parts: the list, and a signature of exactly the list's bytes. The number increases with each
 change, and the roster with the highest number applies.
 """
@@ -35,7 +35,7 @@ from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
-_PURPOSE: Final = b"skyloop roster\n"  # prefix of all content signed here; no other signature uses it
+_PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
@@ -89,7 +89,7 @@ class Roster(msgspec.Struct, frozen=True):
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
-        """Return the next roster, in which this entry replaces the one with the same name."""
+        """Return the next roster, in which this entry replaces the entry with the same name."""
         others = [other for other in self.entries if other.name != entry.name]
         entries = tuple(sorted([*others, entry], key=lambda each: each.name))
         return Roster(self.number + 1, self.lab, entries)
@@ -169,7 +169,7 @@ class Credentials:
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster if the folder has one, otherwise None."""
+        """Return these credentials with the newer roster if the folder has one, otherwise None."""
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 

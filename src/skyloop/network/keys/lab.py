@@ -1,4 +1,4 @@
-"""Manage a lab's authority, a folder that issues and revokes identities, and certificates for cockpit pages.
+"""Manage a lab's authority (a folder that issues and revokes identities) and the certificates for cockpit pages.
 
 ================  ========================================================================
 ``ca.key``        the authority's private key: its holder can create any identity
@@ -8,7 +8,7 @@
 ================  ========================================================================
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
-separate authority, in a folder next to the lab's key folder. Users have their browsers trust it, which is safe because
+separate authority, in a folder next to the lab's key folder. Users make their browsers trust it. This is safe because
 it can't certify anything beyond private networks. Its key and the lab's key can't replace each other.
 
 ============  ==========================================================================
@@ -63,7 +63,7 @@ RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate 
 
 
 class Lab:
-    """An authority that can issue identities, created by :meth:`make` or opened by :meth:`open`.
+    """An authority that can issue identities. Created by :meth:`make` or opened by :meth:`open`.
 
     Each change holds a lock on the folder, so that a change by another process at the same time is not lost.
     """
@@ -111,7 +111,7 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create or renew an identity's key and certificate; a revoked name is free once its lost key has expired."""
+        """Create or renew an identity's key and certificate. A revoked name is free once its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
@@ -152,7 +152,7 @@ class Lab:
         return revoked
 
     def _write_roster(self, roster: Roster) -> None:
-        """Write the roster to the folders of the lab and all identities, so that every copy has the newest one."""
+        """Write the roster to the folders of the lab and of all identities, so that every copy is the newest one."""
         content = encode_roster(roster, self.authority)
         write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:
@@ -180,7 +180,7 @@ def page_certificate(
 ) -> PageFiles:
     """Return a certificate for a cockpit's page: the existing certificate if it is suitable, otherwise a new one.
 
-    ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
+    ``own``: this machine's addresses and names. Those that the authority may not certify are left out. ``wanted``:
     names given by the user, which the authority must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now

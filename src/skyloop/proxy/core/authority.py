@@ -1,9 +1,9 @@
-"""The authority to command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
+"""The authority to command: numbered leases, priorities, and a queue of pilots who wait. Pure: the time is an argument.
 
-Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
-number is unique in this run. A strictly higher priority takes over at once, or after the holder has been asked. A
-pre-empted pilot waits in the queue, which is ordered by priority, then by time of arrival. A holder that requested the
-authority for a limited time loses it once that time is over and the queue isn't empty. See ``docs/proxy.md``.
+Priority 0 is the highest, 31 the lowest. At any time, at most one application *holds* the authority. The holder has a
+lease, whose number is unique in this run. A strictly higher priority takes over at once, or after the holder has been
+asked. A pre-empted pilot waits in the queue, which is ordered by priority and then by arrival. A holder that requested
+the authority for a limited time loses it once that time is over and others are waiting. See ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Queued:
     app_id: int
     priority: int
     position: int
-    wait_ns: int | None = None  #: estimated wait; None: unknown
+    wait_ns: int | None = None  #: estimated waiting time; None if it is unknown
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The holder declined to hand the authority over to ``app_id``, which continues to wait."""
+    """The holder declined to hand the authority over to ``app_id``, and ``app_id`` continues to wait."""
 
     app_id: int
     holder_id: int
@@ -135,7 +135,7 @@ class Authority:
 
     @property
     def owner(self) -> QueueEntry | None:
-        """The owner shown to clients: the holder, or a former one that fell silent and has no successor."""
+        """The owner that clients see: the holder, or a former holder that fell silent and has no successor."""
         return self.holder or self.silent
 
     @property
@@ -153,11 +153,11 @@ class Authority:
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
 
     def asking(self, app_id: int, now_ns: int) -> bool:
-        """Return whether the holder is being asked to hand the authority over to this application."""
+        """Return whether this application is currently asking the holder to hand over the authority."""
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return how long an application must wait if all others keep to their times; None if one has no limit."""
+        """Return how long an application must wait if all others keep to their times; None if any has no limit."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -252,7 +252,7 @@ class Authority:
         return effects
 
     def slept(self, ns: int) -> None:
-        """Make everything older by this time, during which the computer slept and its clock stopped."""
+        """Make everything older by this time, because the computer slept and its clock stopped meanwhile."""
         self.last_command_ns -= ns
         self._granted_ns -= ns
         if self.until_ns is not None:
@@ -295,7 +295,7 @@ class Authority:
         self.until_ns, self._expiry_reported = until_ns, False
 
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
-        """Give the authority to the first in the queue; the holder waits.
+        """Give the authority to the first application in the queue. The former holder then waits.
 
         The old holder keeps its time, but gets at most the new one's priority. Otherwise it would win again at once.
         """
@@ -308,7 +308,7 @@ class Authority:
         return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
 
     def _relieve(self) -> Lost:
-        """End the lease of a holder whose time is over while others wait."""
+        """End the lease of a holder whose time is over, if others are waiting."""
         assert self.holder is not None
         lost = Lost(self.holder.app_id, self.lease, "expired")
         self._vacate()
@@ -330,7 +330,7 @@ class Authority:
         return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
-        """Hand the authority over if due, then report changed positions in the queue."""
+        """Hand the authority over if this is due. Then report changed positions in the queue."""
         return self._hand_over(now_ns) + self._moved(now_ns)
 
     def _hand_over(self, now_ns: int) -> list[Effect]:

@@ -2,12 +2,12 @@
 
 It also handles the return to where the vehicle took off, for all vehicles. This is a series of targets, each judged as
 for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start,
-and a landing or hover there. Both are stepped by the caller. ``docs/proxy.md`` describes the rules of the return.
+and a landing or hover there. The caller steps both. ``docs/proxy.md`` describes the rules of the return.
 
 A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
 a velocity loop (proportional and integral, the usual cascade for small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
-"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103: to accelerate
-forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down: negative roll.
+"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103. To accelerate
+forward, the nose goes down (positive pitch). To accelerate left, the left side goes down (negative roll).
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ PERIOD_S: Final = 0.02  #: step period that the autopilot is designed for
 ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
-GO_GAIN: Final = 0.9  #: speed per remaining metre on the way to a target [1/s]
+GO_GAIN: Final = 0.9  #: speed for each metre that remains to the target [1/s]
 GO_SPEED: Final = 1.0  #: maximum speed on the way to a target if none is given [m/s]
 GO_DECELERATION: Final = 0.6  #: deceleration towards the target [m/s²]
 TURN_GAIN: Final = 1.5  #: yaw rate per radian that remains to turn [1/s]
 TURN_RATE: Final = 1.2  #: maximum yaw rate if none is given [rad/s]
-SETTLED_SPEED: Final = 0.2  #: speed below which a hover fixes its position [m/s]
+SETTLED_SPEED: Final = 0.2  #: speed below which a hover holds its position [m/s]
 ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
 LONGEST_RISE: Final = 2.0  #: a take-off ends after this multiple of its nominal duration, ...
 LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
 # Return flight:
-NEAR_M: Final = 0.3  #: a vehicle this close, and at rest, has arrived
-CLOSE_M: Final = 1.0  #: a vehicle this close has arrived if it gets no closer
+NEAR_M: Final = 0.3  #: a vehicle that is this close and at rest has arrived
+CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arrived
 AT_REST_M_S: Final = 0.3
 HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this ...
 STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
@@ -127,10 +127,10 @@ class Autopilot:
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
-        self._integral = (0.0, 0.0)  # integrals forward and left [rad]
+        self._integral = (0.0, 0.0)  # integrals in the forward and left directions [rad]
         self._stepped_ns: int | None = None
         self._lifted_ns: int | None = None  # when the take-off left the ground
-        self._from_height: float | None = None  # height according to the position at that time [m]
+        self._from_height: float | None = None  # height at that time, according to the position [m]
         self._altitudes: set[float] = set()  # lowest and highest readings since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
@@ -143,7 +143,7 @@ class Autopilot:
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
-                self._hold_yaw = None  # from now on, keep the yaw reached so far, not the earlier one
+                self._hold_yaw = None  # from now on, hold the current yaw instead of the earlier one
             self._target = action
         if mode is self.mode:
             return
@@ -155,14 +155,14 @@ class Autopilot:
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
 
     def stop(self, action_name: str) -> None:
-        """Stop steering, because the vehicle itself is executing an action now."""
+        """Stop steering, because the vehicle itself is now executing an action."""
         self.mode = Mode.OFF
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
         """Stop moving, because the vehicle failed to execute the action that was to replace this task."""
         if isinstance(self._target, Position) and self._target.yaw is not None:
-            self._hold_yaw = None  # keep the yaw reached so far, as in `start`
+            self._hold_yaw = None  # hold the current yaw, as in ``start``
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
@@ -236,7 +236,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # the vehicle may be anywhere when it is next received, and will hold that position
+        if known is None:  # the vehicle may be anywhere when it is next received, and will then hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -277,7 +277,7 @@ class Autopilot:
         )
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
-        """Return the roll and pitch [rad] for reaching a velocity; level while the velocity is unknown."""
+        """Return the roll and pitch [rad] for reaching a velocity; both are 0 while the velocity is unknown."""
         self.drifts = known is None or known.velocity_m_s is None
         if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
@@ -322,10 +322,10 @@ class StartPoint:
         self._state = FlightState.UNKNOWN
         self._standing_ns: int | None = None  # start of the current period of time on the ground; None in the air
         self._flew = False  # whether the vehicle has been seen in the air
-        self._open = False  # whether the vehicle is taking off and its position is not known yet
+        self._open = False  # whether the vehicle is taking off and its position is still unknown
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
-        """Observe the vehicle; if it briefly reports "landed" while in the air, the start does not change."""
+        """Observe the vehicle. If it briefly reports "landed" while in the air, the start does not change."""
         before, self._state = self._state, state
         if state in _GROUNDED:
             if self._standing_ns is None:
@@ -353,7 +353,7 @@ class ReturnDecision(NamedTuple):
 
     action: Position | Land | None = None  #: the vehicle's next action; None if it must stop
     clamps: tuple[Clamp, ...] = ()
-    refusal: Refusal | None = None  #: None also (like ``action``) if the return only waits for a fresh position
+    refusal: Refusal | None = None  #: also None (like ``action``) if the return is only waiting for a fresh position
     why: str = ""  #: readable reason for the refusal
     lasting: bool = False  #: whether it is pointless to wait for a fresh position
     enforced: bool | None = None  #: whether box and zones were enforced; None if none are set or there is no target

@@ -3,7 +3,7 @@
 The library repeats each command many times a second. A repeat refers to its intent. It is checked again during the
 intent, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends an intent.
 
-The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
+The checks come in this order: sequence, age, lease and finite numbers (:meth:`CommandChecks.receive`; these four decide
 whether a command is a sign of life of the holder); then whether its intent is in progress, the vehicle link, support,
 whose flight it is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). ``docs/proxy.md``
 describes the rules.
@@ -71,7 +71,7 @@ class Intent:
     fate: Fate = Fate.UNDER_WAY
     begun: bool = False  #: whether the vehicle has started to execute the intent
     automatic: bool = False  #: whether the library itself requested the intent
-    withdrew: bool = False  #: whether it ended a take-off that had not left the ground
+    withdrew: bool = False  #: whether the intent ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
 
@@ -81,18 +81,18 @@ class Intent:
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End the intent unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
+        """End the intent unless it has already ended. ``text`` and ``reason`` answer its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
             self.text = "" if silent else text or f"{ENDINGS[fate]}: send a new command"
-            self.fate = fate  # last, because other threads read it without a lock
+            self.fate = fate  # set last, because other threads read it without a lock
 
     def refuse(self, reason: Refusal, why: str) -> None:
         """End the intent with a refusal.
 
-        Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
-        Resets always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. Resets
+        always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -133,7 +133,7 @@ class Intent:
 
         A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
-        fate = self.fate  # read first, because another thread may end the intent now
+        fate = self.fate  # read this first, because another thread may end the intent now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -155,12 +155,12 @@ class Intents:
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
         self._floor = -1  # intents up to this one were ended by an event
-        self._ended = Fate.AUTHORITY  # fate of the intents that the event ended
+        self._ended = Fate.AUTHORITY  # fate of the intents that this event ends
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
-        """Check sequence, age, lease and numbers, and remember the sequence.
+        """Check a command's sequence, age, lease and numbers, and remember its sequence.
 
-        ``lease``: the lease in force (0 if there is none); ``holds``: whether the sender holds it. Returns None if the
+        ``lease``: the lease in force (0 if there is none). ``holds``: whether the sender holds it. Returns None if the
         command counts as a sign of life.
         """
         if command.seq <= self.seq:
@@ -178,7 +178,7 @@ class Intents:
         return None
 
     def intent_of(self, command: Command, state: FlightState, now_ns: int) -> tuple[Intent, bool]:
-        """Return the intent of a command that passed :meth:`check`, and whether it is a new request."""
+        """Return the intent of a command that passed :meth:`check`, and whether the command is a new request."""
         newest, number = self.newest, command.intent
         if number == newest.number:
             return newest, False
@@ -196,7 +196,7 @@ class Intents:
         return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
-        """Handle an emergency stop, which is executed regardless of its sequence number and ends all requests."""
+        """Handle an emergency stop. It is executed regardless of its sequence number, and ends all requests."""
         assert type(command.action) is EmergencyStop
         self.seq, self._received = max(self.seq, command.seq), max(self._received, command.intent)
         self.end(Fate.EMERGENCY)
@@ -293,7 +293,7 @@ class CommandChecks:
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide on a command whose intent is in progress, other than an emergency stop or idle.
+        """Decide on a command whose intent is in progress. It must not be an emergency stop or idle.
 
         ``new``: whether this is a new request, and neither a repeat nor one that the library makes (``automatic``).
         """

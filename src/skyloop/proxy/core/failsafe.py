@@ -1,7 +1,7 @@
-"""The failsafe ladder, which decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
+"""The failsafe ladder. It decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
 
-Steps escalate automatically (none, hover, land), and end only with a fresh command or on the ground. The vehicle may
-first fly back to its start, if parameters require that and nothing prevents it. ``docs/proxy.md`` has the rules.
+Steps escalate automatically (none, hover, land). They end only with a fresh command or on the ground. The vehicle may
+first fly back to its start, if parameters require this and nothing prevents it. ``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations
@@ -83,14 +83,14 @@ class StepChange:
 
 @dataclass(frozen=True, slots=True)
 class BatteryLow:
-    """The battery fell below the warning level; published once."""
+    """The battery charge fell below the warning level. Published once."""
 
     battery: float
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeAction:
-    """An action for the vehicle; report the result with :meth:`FailsafeLadder.attempted`."""
+    """An action for the vehicle. Report its result with :meth:`FailsafeLadder.attempted`."""
 
     action: FailsafeTask
 
@@ -101,9 +101,9 @@ Effect = StepChange | BatteryLow | FailsafeAction
 def due(
     now_ns: int, inputs: FailsafeInputs, settings: FailsafeSettings, *, barred: str, battery_low: bool
 ) -> tuple[Failsafe, str]:
-    """Return the step that is due for our own flight, and the reason, according to time, battery and link.
+    """Return the step that is due for a flight of the proxy, and the reason, based on time, battery and link.
 
-    ``battery_low``: whether the charge is too low to continue without a return, and the pilot has not overruled that.
+    ``battery_low``: whether the charge is too low to continue without a return, unless the pilot has overruled this.
     """
     if barred:
         return Failsafe.LAND, barred
@@ -132,16 +132,16 @@ class FailsafeLadder:
         self.barred = ""  #: why set-points are currently refused: ``battery``, ``closing``, or empty if they are not
         self._closing = False
         self._warned = False
-        self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
+        self.battery_low = False  #: whether the charge has fallen below the level for a return and has not recovered
         self._overruled = False  # whether the pilot has overruled a return because of the battery
         self._wanted: FailsafeTask | None = None
         self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
-        self.wanted_ns = 0  #: when the current task began
+        self.wanted_ns = 0  #: time at which the current task began
         self._taken = False
         self._next_try_ns = 0
 
     def update(self, now_ns: int, inputs: FailsafeInputs) -> list[Effect]:
-        """Take the steps that are due. Call at a steady pace, and at once after relevant changes."""
+        """Perform the steps that are due. Call at a steady pace, and at once after relevant changes."""
         effects = self._battery(inputs)
         self.given_up &= inputs.airborne and not inputs.link_up
         if not inputs.airborne:
@@ -201,17 +201,17 @@ class FailsafeLadder:
 
     @property
     def lands(self) -> bool:
-        """Whether it makes the vehicle land, here or at its start, no matter who requested that."""
+        """Whether the intent makes the vehicle land, here or at its start, no matter who requested the landing."""
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:
-        """Continue a landing whose pilot has left, or while the vehicle link is lost."""
+        """Continue a landing whose pilot has left, or a landing during a loss of the vehicle link."""
         if not self.lands:
             self._want(Land(), now_ns)
 
     @property
     def acts(self) -> bool:
-        """Whether the ladder makes the vehicle hover or land."""
+        """Whether the ladder is making the vehicle hover or land."""
         return self._wanted is not None
 
     def give_up(self) -> None:

@@ -25,7 +25,7 @@ from skyloop.messages import (
     Velocity,
 )
 
-#: A requested take-off that has no visible effect within this time is no longer ours; drivers give up sooner.
+#: If a requested take-off has no visible effect after this time, no flight is attributed to it. Drivers give up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
 #: If the vehicle takes off although the take-off was cancelled, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
@@ -38,7 +38,7 @@ AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as fly
 STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent that makes no progress has reached the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
-BLIND_NS: Final = 15 * NS_PER_S  #: duration after which the result of a landing without sensor data is unknown
+BLIND_NS: Final = 15 * NS_PER_S  #: after this time, the result of a landing without sensor data is unknown
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
@@ -91,7 +91,7 @@ class Flight:
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
         self._begun_ns = 0  # time at which the steered task began
         self._was_up = False  # whether the vehicle has reported being in the air while steered
-        self._landed_ns: int | None = None  # when it first reported being landed while steered
+        self._landed_ns: int | None = None  # time at which it first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
         self._blind_ns: int | None = None  # time at which a landing lost its sensor data
@@ -123,14 +123,14 @@ class Flight:
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
-        """Return whether a take-off has no visible effect yet, so that a vehicle on the ground may be about to fly."""
+        """Return whether a take-off has had no visible effect yet. A vehicle on the ground may then be about to fly."""
         return self._claimed_until_ns is not None and now_ns < self._claimed_until_ns
 
-    # Whose is it? ------------------------------------------------------------------------------------------------
+    # Whose flight it is ------------------------------------------------------------------------------------------
 
     @property
     def ours(self) -> bool:
-        """Whether the proxy may hold, land or stop the vehicle on its own initiative."""
+        """Whether the proxy may make the vehicle hover, land or stop on its own initiative."""
         return self.whose is Whose.OURS
 
     @property
@@ -152,22 +152,22 @@ class Flight:
         self._believed_until_ns = until_ns
 
     def claim(self, now_ns: int) -> None:
-        """Record a requested take-off, so that the resulting flight is ours."""
+        """Record that a take-off was requested, so that the resulting flight counts as the proxy's."""
         self._claimed_until_ns = now_ns + CLAIM_NS
         if self.whose is Whose.NOBODYS:
             self.whose = Whose.OURS
 
     def call_off(self, now_ns: int) -> None:
-        """Record that a take-off has been cancelled before it had a visible effect."""
+        """Record that a take-off was cancelled before it had a visible effect."""
         if self._claimed_until_ns is not None:
             self._claimed_until_ns = min(self._claimed_until_ns, now_ns + CALLED_OFF_NS)
 
     def take(self) -> None:
-        """Record that an application's new intent was executed; from now on, the flight is ours."""
+        """Record that an application's new intent was executed. From now on, the flight belongs to the proxy."""
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Assume that a vehicle found in the air from now on may be on another flight; return whether it may."""
+        """Assume from now on that a vehicle found in the air may be on another flight; return whether it may be."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared
@@ -247,7 +247,7 @@ class Flight:
             self._seen_up = False
 
     def steer(self, state: FlightState, now_ns: int) -> None:
-        """Record that the software autopilot is starting the task with this state."""
+        """Record that the software autopilot is starting the task that this state stands for."""
         if not self._steered:
             self._was_up, self._landed_ns = False, None
         self._steered, self._state, self._begun_ns = True, state, now_ns
@@ -264,7 +264,7 @@ class Flight:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
     def refused(self, reported: FlightState) -> bool:
-        """Handle a refusal by the vehicle; return whether it ends a take-off from the ground."""
+        """Handle a refusal by the vehicle. Return whether the refusal ends a take-off from the ground."""
         if not (self._steered and self._state is FlightState.TAKING_OFF and reported is FlightState.LANDED):
             return False
         self._steered, self._state = False, FlightState.LANDED

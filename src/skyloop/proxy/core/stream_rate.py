@@ -1,13 +1,13 @@
 """Estimate the stream rate that a path can carry, based on a subscriber's acknowledgements. Pure: time is an argument.
 
-Low delay has priority. The part of a frame's round trip beyond the shortest recent one counts as waiting in the path.
-If there is a standing queue, the rate falls below the delivery rate (as in Cardwell et al., "BBR: Congestion-Based
-Congestion Control", ACM Queue 14(5), 2016). A mobile network may carry ten times as much in one tenth of a second as in
-the next. When the rate is close to the network's average, frames are therefore often late. Each late frame also reduces
-the rate, which then grows so slowly that few are late. No frame is started while more is in flight than the path
-delivers in :data:`MOST_WAIT_S`. A stalled path therefore holds a few frames rather than seconds of them, and no encoded
-frame has to be dropped. While the path is stalled, single frames are sent at increasing intervals, because anything
-queued delays the first fresh frame, which is sent as soon as an acknowledgement arrives.
+Low delay has priority. The part of a frame's round trip that exceeds the shortest recent round trip counts as waiting
+in the path. If there is a standing queue, the rate falls below the delivery rate (as in Cardwell et al., "BBR:
+Congestion-Based Congestion Control", ACM Queue 14(5), 2016). A mobile network may carry ten times as much in one tenth
+of a second as in the next. When the rate is close to the network's average, frames are therefore often late. Each late
+frame also reduces the rate, which then grows so slowly that few are late. No frame is started while more is in flight
+than the path delivers in :data:`MOST_WAIT_S`. A stalled path therefore holds a few frames rather than seconds of them,
+and no encoded frame has to be dropped. While the path is stalled, single frames are sent at increasing intervals,
+because anything queued delays the first fresh frame, which is sent as soon as an acknowledgement arrives.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ LEAST_KBIT_S: Final = 60
 #: The initial rate. Isolated late frames do not reduce the rate further: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
-STANDING_S: Final = 0.25  #: the shortest wait within this time is due to a standing queue …
-LONG_WAIT_S: Final = 0.06  #: … and if it is longer than this, the rate falls …
-FALL: Final = 0.85  #: … to this fraction of the delivery rate …
-GOOD_WAIT_S: Final = 0.03  #: … and if it is shorter than this, the rate grows
-LATE_S: Final = 0.1  #: a single frame that has waited this long is late …
-LATE_FALL: Final = 0.7  #: … and the rate falls to this fraction …
-LATE_EVERY_S: Final = 0.15  #: … only once for all frames that were delayed together within this time
-GROWTH_1_S: Final = 0.1  #: growth of the rate per second …
-SEARCH_1_S: Final = 2.0  #: … and growth when the rate is below the initial rate, or while no frame has been late
+STANDING_S: Final = 0.25  #: the shortest wait within this time is due to a standing queue
+LONG_WAIT_S: Final = 0.06  #: the rate falls if the wait in a standing queue is longer than this
+FALL: Final = 0.85  #: fraction of the delivery rate that the rate then falls to
+GOOD_WAIT_S: Final = 0.03  #: the rate grows if the wait in a standing queue is shorter than this
+LATE_S: Final = 0.1  #: a single frame that has waited this long is late
+LATE_FALL: Final = 0.7  #: factor for the rate after a late frame
+LATE_EVERY_S: Final = 0.15  #: all late frames within this time reduce the rate only once
+GROWTH_1_S: Final = 0.1  #: growth of the rate per second
+SEARCH_1_S: Final = 2.0  #: the same below the initial rate, or while no frame has been late
 MOST_WAIT_S: Final = 0.08  #: maximum delivery time of the frames in flight, beyond the shortest round trip
-SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled, which the rate did not cause …
-SILENT_FALL: Final = 0.5  #: … but the rate is reduced by this factor, because it is uncertain after the stall
-PROBE_S: Final = 0.15  #: while frames wait, one is sent this often unless more is in flight than the rate allows in …
-PROBES_S: Final = 0.1  #: … this time; during silence, one is sent …
-SELDOM: Final = 1 / 3  #: … after this fraction of the silence so far …
-SELDOM_S: Final = 0.5  #: … or after this time, if it is shorter
+SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled (the rate is not the cause)
+SILENT_FALL: Final = 0.5  #: factor for the rate after a stall, because the path's rate is then uncertain
+PROBE_S: Final = 0.15  #: interval between frames while frames wait
+PROBES_S: Final = 0.1  #: no frame is sent if more is in flight than the rate delivers in this time
+SELDOM: Final = 1 / 3  #: during silence, the interval is this fraction of the silence so far
+SELDOM_S: Final = 0.5  #: maximum interval between frames during silence
 LOST_S: Final = 1.0  #: frames without an acknowledgement after this time count as lost
-SHORTEST_S: Final = 10.0  #: how long a shortest round trip remains valid
+SHORTEST_S: Final = 10.0  #: maximum age of a shortest round trip
 _FEWEST: Final = 3  # number of frames needed to judge a queue
 
 
@@ -55,17 +55,17 @@ class StreamRate:
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the current rate
-        self.wait_s = 0.0  #: minimum time that frames are currently waiting in the path [s]
+        self.wait_s = 0.0  #: minimum time that frames currently wait in the path [s]
         self.lost = 0  #: number of frames that were never acknowledged
         self._most_kbit_s = most_kbit_s
         self._searches = True  # whether nothing has been late yet
         self._silent = False  # whether the path has stalled
         self._quiet_ns = 0  # start of the period with frames in flight but no acknowledgement; 0: none are in flight
-        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # when the path resumed after a stall
-        self._owed = False  # whether a frame must be sent at once
+        self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # time at which the path resumed after a stall
+        self._owed = False  # whether a frame must be sent immediately
         self._under_way: deque[_Sent] = deque()
         self._bytes = 0  # number of bytes in flight
-        self._sent_ns = now_ns - nanoseconds(LOST_S)  # when the newest frame was sent
+        self._sent_ns = now_ns - nanoseconds(LOST_S)  # time at which the newest frame was sent
         self._delivered = 0
         self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] with their times, each longer than the last
         self._waits: deque[tuple[float, int, int]] = deque()  # waits [s], their times, amount delivered until then
@@ -94,11 +94,11 @@ class StreamRate:
         return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
 
     def _holds(self, time_s: float) -> bool:
-        """Return whether no more is in flight than the rate delivers in this time [s]."""
+        """Return whether the amount in flight is no more than the rate delivers in this time [s]."""
         return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
-        """Record that a frame was handed to the transport; ``seq`` is higher than all earlier ones."""
+        """Record that a frame was handed to the transport. ``seq`` is higher than for all earlier frames."""
         self._under_way.append(_Sent(seq, size, now_ns))
         self._bytes += size
         self._quiet_ns = self._quiet_ns or now_ns
@@ -183,7 +183,7 @@ ENOUGH_BITS: Final = 0.05  #: bits per sent pixel below which compression blocks
 
 
 def picture_form(kbit_s: float, pixels_1_s: float) -> tuple[float, float]:
-    """Return the factor for width and height, and the fraction of frames to send, at a given rate."""
+    """Return the factor for width and height and the fraction of frames to send, for a given rate."""
     for scale, share in _LADDER:
         if kbit_s * 1000.0 >= ENOUGH_BITS * pixels_1_s * scale**2 * share:
             return scale, share

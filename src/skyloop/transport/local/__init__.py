@@ -53,10 +53,10 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """List by name the running proxies on this host that this user can reach; none on systems other than Linux.
+    """Return the names of the running proxies on this host that this user can reach; none on systems other than Linux.
 
-    Removes sockets left by killed proxies. ``group``: as for :func:`dial`. Raises :class:`LinkError` if the directory
-    of sockets is not safe.
+    Removes the sockets that killed proxies left behind. ``group``: as for :func:`dial`. Raises :class:`LinkError` if
+    the directory of sockets is not safe.
     """
     if sys.platform != "linux":
         return []

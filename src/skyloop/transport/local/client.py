@@ -27,7 +27,7 @@ from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's packet
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # interval between retries for packets that did not fit into a full socket
-_CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over if nothing arrives
+_CHECK_S: Final = 0.05  # interval at which a leading thread checks whether its wait is over if nothing arrives
 _STAND_BY_S: Final = 0.002  # how long no other thread receives after the leading thread has returned with its sample
 _MAX_CAPACITY: Final = 1 << 31  # maximum memory that a client maps for a server
 _log = logging.getLogger(__name__)
@@ -36,10 +36,10 @@ _log = logging.getLogger(__name__)
 class LocalClient(TransportClient):
     """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`; it receives at once."""
 
-    # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
-    # for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing it to another thread takes
-    # a second wake-up, which costs as much as the whole path from the proxy. While a thread leads, the receiving thread
-    # stands by; it takes over once no thread has received for two milliseconds.
+    # The thread that holds ``_turn`` receives and delivers. It is either the receiving thread or an application's
+    # thread that waits for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing the
+    # packet to another thread takes a second wake-up, which costs as much as the whole path from the proxy. While a
+    # thread leads, the receiving thread stands by; it takes over once no thread has received for two milliseconds.
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -116,7 +116,7 @@ class LocalClient(TransportClient):
         return self._address
 
     def _end(self, reason: str) -> None:
-        """End the connection. Idempotent; the receiving thread does the rest."""
+        """End the connection. Idempotent. The receiving thread does the rest."""
         sock = self._socket
         if sock is not None and not self._closing:
             self._reason = reason
@@ -131,7 +131,7 @@ class LocalClient(TransportClient):
             self._send_own(packet)
 
     def _send_own(self, packet: bytes) -> None:
-        """Send one of the transport's own packets, or queue it if it does not fit now.
+        """Send one of the transport's own packets, or queue the packet if it does not fit now.
 
         The garbage collector may call this on any thread at any point, so it must not acquire a lock.
         """
@@ -149,7 +149,7 @@ class LocalClient(TransportClient):
                 return
         self._unsent.append(packet)
 
-    # --- the receiving thread ---
+    # --- on the receiving thread ---
 
     def _run(self, sock: Socket) -> None:
         while not self._ended:
@@ -183,7 +183,7 @@ class LocalClient(TransportClient):
     # --- the thread that has the turn ---
 
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
-        """Deliver until ``over`` returns True or the connection ends.
+        """Deliver packets until ``over`` returns True or the connection ends.
 
         On the application's main thread, an exception raised by a signal handler during the wait propagates from here.
         """
@@ -194,7 +194,7 @@ class LocalClient(TransportClient):
             self._receiver = 0
 
     def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
-        """Deliver until ``over`` returns True or the connection ends; if it ended, return the reason."""
+        """Deliver packets until ``over`` returns True or the connection ends. If it ended, return the reason."""
         receive = sock.recvmsg
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
@@ -239,7 +239,7 @@ class LocalClient(TransportClient):
         return self._reason or "closed by the application"
 
     def _control(self, packet: bytes, descriptors: list[int]) -> None:
-        """Handle one of the transport's own packets other than a frame, and close its descriptors."""
+        """Handle one of the transport's own packets other than a frame, and close the packet's descriptors."""
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
@@ -257,7 +257,7 @@ class LocalClient(TransportClient):
                 os.close(descriptor)
 
     def _send_waiting(self, sock: Socket) -> None:
-        """Send the releases from this turn, and packets that did not fit into the socket earlier."""
+        """Send the releases from this turn, and the packets that did not fit into the socket earlier."""
         while self._releases:
             self._unsent.append(self._releases.popleft())
         try:
@@ -284,11 +284,11 @@ class SlotView:
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
     def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
-        """Map the memory, unless it could shrink while it is read; ``fd`` still belongs to the caller."""
+        """Map the memory, unless it could shrink while it is read. The caller still owns ``fd``."""
         self.number = number
         self.camera = camera
         self.capacity = capacity
-        self.held = held  #: numbers of all of this camera's slots that the application holds
+        self.held = held  #: numbers of all slots of this camera that the application holds
         try:
             seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
         except OSError:
@@ -303,7 +303,7 @@ class SlotView:
         self._interface = self._describe(capacity)
 
     def interface(self, size: int) -> dict[str, Any]:
-        """Return NumPy's description of the first ``size`` bytes; it is cached until the size changes."""
+        """Return NumPy's description of the first ``size`` bytes. It is cached until the size changes."""
         if self._interface["shape"][0] != size:
             self._interface = self._describe(size)
         return self._interface
@@ -327,7 +327,7 @@ class Lease:
 
 
 class Leases:
-    """A client's slots. The garbage collector may call :meth:`released` on any thread at any point."""
+    """The slots of one client. The garbage collector may call :meth:`released` on any thread at any point."""
 
     #: Number of a camera's frames that an application may hold in place. Further frames are copied, so that an
     #: application that collects frames does not use up all slots of the server and starve itself.
@@ -339,7 +339,7 @@ class Leases:
         self._held: dict[int, set[int]] = {}
 
     def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot announced by the server; ``fd`` still belongs to the caller."""
+        """Map a slot that the server announced. The caller still owns ``fd``."""
         self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
 
     def retire(self, camera: int, before: int) -> None:

@@ -1,4 +1,4 @@
-"""The directory of sockets, in which proxies are found by name, and its access rules.
+"""The directory of sockets, where proxies are found by name, and its access rules.
 
 Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
 The variable ``SKYLOOP_RUNTIME_DIR`` sets it. The default is ``skyloop`` in the user's runtime directory. A
@@ -39,7 +39,7 @@ PROXY: Final = "proxy"
 HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
-_OPEN_TO_OTHERS: Final = 0o027  # permissions: writable by the group, or any access for others
+_OPEN_TO_OTHERS: Final = 0o027  # file permissions: writable by the group, or any access for others
 
 
 class Proxy(NamedTuple):
@@ -47,7 +47,7 @@ class Proxy(NamedTuple):
 
     name: str
     pid: int | None  #: process id; None if the process is too busy to report it
-    path: Path  #: path of its socket
+    path: Path  #: path of the server's socket
 
 
 class Directory:
@@ -60,7 +60,7 @@ class Directory:
         self._suffix = _SUFFIXES[kind]
 
     def socket_path(self, name: str) -> Path:
-        """Return the path of a proxy's socket, which must not be longer than :data:`MAX_PATH`."""
+        """Return the path of a proxy's socket. It must not be longer than :data:`MAX_PATH`."""
         check_name(name)
         path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
@@ -104,7 +104,7 @@ class Directory:
             )
 
     def proxies(self) -> list[Proxy]:
-        """List the running proxies by name, and remove sockets left by killed ones."""
+        """List the running proxies by name, and remove the sockets that killed proxies left behind."""
         try:
             self.check()
         except FileNotFoundError:
@@ -149,7 +149,7 @@ class Directory:
             return listener, path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
-        """Remove the socket with this name if its file still has this inode; errors are ignored."""
+        """Remove the socket with this name if its file still has this inode. Errors are ignored."""
         path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
             if path.lstat().st_ino == inode:

@@ -1,8 +1,8 @@
 """Manage the server's frame slots: which are free, which clients hold them, and which viewers await a frame.
 
 A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
-:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. There
-is always a free slot, because each viewer can hold only a limited number of slots.
+:data:`MAX_LEASES` frames, or whose socket is full, is skipped. Once it releases a frame, it gets the newest frame.
+There is always a free slot, because each viewer can hold only a limited number of slots.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from skyloop.transport.local import packets
 
 MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, including frames in transit
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# Once the server has mapped the memory, it keeps that writeable view; no other can be created, and the size can't be
-# changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
+# Once the server has mapped the memory, it keeps that writeable view. No other writeable view can be created, and the
+# size can't be changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
 class SlotMemory:
-    """One slot at the server: memory for a frame, and the number of its holders."""
+    """One slot at the server: memory for a frame, and the number of holders."""
 
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
@@ -45,7 +45,7 @@ class SlotMemory:
         self.capacity = capacity
         self.holders = 0  #: clients that hold the slot, plus the server while it writes to it or keeps it for viewers
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.posix_fallocate(self.fd, 0, capacity)  # fail here if memory is short, rather than during a copy
+        os.posix_fallocate(self.fd, 0, capacity)  # if memory is short, fail here rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
         self.array: Pixels = np.frombuffer(view, np.uint8)
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
@@ -116,7 +116,7 @@ class Camera:
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
-        self.viewers: dict[Connection, Viewer] = {}  # including inactive ones, which only hold frames
+        self.viewers: dict[Connection, Viewer] = {}  # including inactive viewers, which only hold frames
         self.active: tuple[Viewer, ...] = ()  # viewers that get frames
         self._generation = 0
         self._geometry: object = None
@@ -124,7 +124,7 @@ class Camera:
         self._free: list[SlotMemory] = []
         self._count = 0  # number of slots in this generation
         self._slot_numbers = slot_numbers
-        self._next_number = 0  # higher than the numbers of all slots so far
+        self._next_number = 0  # higher than the numbers of all earlier slots
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
@@ -158,13 +158,13 @@ class Camera:
         return missed
 
     def drop(self, slot: SlotMemory) -> None:
-        """Remove one hold on a slot, which is free again if there are no others."""
+        """Remove one hold on a slot. The slot is free again if there are no others."""
         slot.holders -= 1
         if slot.holders == 0 and slot.generation == self._generation:
             self._free.append(slot)
 
     def released(self, viewer: Viewer, number: int) -> bool:
-        """Take a slot back from a viewer, if it holds it, and send it the newest frame if it is waiting for one."""
+        """Take a slot back from a viewer that holds it. If the viewer waits for a frame, send it the newest."""
         slot = viewer.leases.pop(number, None)
         if slot is None:
             return False
@@ -184,19 +184,19 @@ class Camera:
         """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
-        with contextlib.suppress(OSError):  # if this fails, the client keeps the slots mapped until it ends
+        with contextlib.suppress(OSError):  # if this fails, the slots stay mapped in the client until it ends
             viewer.connection.transmit(packets.retire(self.number, self._next_number))
         self._trim()
 
     def leave(self, connection: Connection) -> None:
-        """Remove a client that is gone, and free all its slots."""
+        """Remove a client that has left, and free all its slots."""
         if (viewer := self.viewers.pop(connection, None)) is not None:
             for slot in viewer.leases.values():
                 self.drop(slot)
             self._trim()
 
     def _trim(self) -> None:
-        """Release memory that the remaining viewers cannot need."""
+        """Release memory that the remaining viewers can't need."""
         self._count_active()
         if not self.active or self._count > (MAX_LEASES * len(self.viewers)) + 2:
             self.retire()
@@ -233,7 +233,7 @@ class FrameExchange:
         self._camera_numbers = itertools.count(1)
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Copy a frame once and send it to the camera's viewers; return how many missed it: all if memory ran out."""
+        """Copy a frame once and send it to the camera's viewers; return how many missed it (all if memory ran out)."""
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
             return 0
@@ -249,7 +249,7 @@ class FrameExchange:
             return camera.offer(slot, packet)
 
     def subscribe(self, connection: Connection, name: str) -> None:
-        """Send a camera's frames to a connection, starting with the next one."""
+        """Send a camera's frames to a connection from the next frame on."""
         with self._lock:
             camera = self._cameras.get(name)
             if camera is None:
@@ -272,7 +272,7 @@ class FrameExchange:
         return False
 
     def leave(self, connection: Connection) -> None:
-        """Remove a client that is gone from all cameras."""
+        """Remove a client that has left from all cameras."""
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)

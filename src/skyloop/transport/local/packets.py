@@ -27,8 +27,8 @@ class LocalKind(IntEnum):
     RELEASE = 0x42  #: client to server: the client no longer uses the frame in this slot
     SLOT = 0x43  #: server to client, with the slot's descriptor
     FRAME = 0x44  #: server to client: a slot holds a frame
-    RETIRE = 0x45  #: server to client: a camera's older slots will not be used again
-    BYE = 0x46  #: either direction: why the connection ends
+    RETIRE = 0x45  #: server to client: the older slots of a camera will not be used again
+    BYE = 0x46  #: either direction: the reason why the connection ends
     WAKE = 0x47  #: client to server: older applications send this before each command, and it is ignored
 
 

@@ -1,4 +1,4 @@
-"""One thread that receives for many local transport servers, which can leave it if one of them blocks it.
+"""One thread that receives for many local transport servers. The others can leave it if one of them blocks it.
 
 A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call fewer, which is
 better for one vehicle. With a hundred vehicles, however, two hundred threads would wake one another. Here, one thread
@@ -7,7 +7,7 @@ Landings and stops come first, then set-points, then all others. Each class gets
 
 Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server. :attr:`Reactor.entries`
 counts the calls, so that a watchdog can detect a call that does not return. It then calls :meth:`Reactor.split`, which
-leaves this thread to that server and moves all others to a new reactor.
+leaves this thread to that server and moves all other servers to a new reactor.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Socket
 from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
-CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
+CHECK_S: Final = 0.5  #: interval between checks of silent connections, and of listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
 _PAUSE_S: Final = 100e-6  # if a wait took this long, no packet was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: Order of the lanes, turn by turn: even if something is always urgent, the others each get one turn in four.
+#: Order in which the lanes take turns. Even if something is always urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 class Source:
-    """A socket that a reactor waits for: a server's listener (``sock``), or one of its connections."""
+    """A socket that a reactor waits for: either a server's listener (``sock``) or one of its connections."""
 
     def __init__(
         self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
@@ -76,7 +76,7 @@ class Reactor:
         self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._epoll.register(self._waker, select.EPOLLIN)
         self._closing = False
-        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources with packets to handle
+        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources that have packets to handle
         self._resumed: deque[Source] = deque()
         self._turns = 0
         self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
@@ -110,7 +110,7 @@ class Reactor:
 
     @property
     def empty(self) -> bool:
-        """Whether it has no sockets."""
+        """Whether the reactor has no sockets."""
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
@@ -150,7 +150,7 @@ class Reactor:
         with contextlib.suppress(OSError):
             os.eventfd_write(self._waker, 1)
 
-    # --- its thread ---
+    # --- on its thread ---
 
     def _run(self) -> None:
         checked_s = time.monotonic()
@@ -177,13 +177,13 @@ class Reactor:
                     self._check()
             except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must continue
                 _log.exception("a turn of the receiving thread failed; it continues")
-                time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up the whole processor
+                time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up all processor time
         self.inside = None
         os.close(self._waker)
         self._epoll.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
-        """Read a packet from each socket, to see which are urgent or superseded; return whether more may be waiting."""
+        """Read a packet from each socket to see which are urgent or superseded; return whether more may wait."""
         sources, more = self._sources, False
         for fileno, _ in ready:
             source = sources.get(fileno)
@@ -273,14 +273,14 @@ class SharedLocalServer(LocalServer):
                 while self._served and not self.reactor.over:
                     self._left.wait(_THREAD_CHECK_S)
             with self._lock:
-                for left in self.reactor.remaining_of(self):  # the thread ended first: nothing else returns these
+                for left in self.reactor.remaining_of(self):  # the thread ended first, and nothing else returns these
                     assert left.connection is not None
                     self._finish_connection(left, left.connection, "the proxy stopped")
 
     def _drop(self, source: Source) -> None:
         """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # a socket moving to another reactor is dropped there as soon as it is noticed
+        self.reactor.remove(source)  # if a socket moves to another reactor, this one drops it as soon as it notices
 
     # --- on the reactor's thread ---
 
@@ -329,7 +329,7 @@ class SharedLocalServer(LocalServer):
             return None if source.ended else self._lane(source, connection)
 
     def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
-        """Return the lane in which to queue a source; None if nothing waits, or it is in that lane already."""
+        """Return the lane in which to queue a source; None if it has no packets or is already in that lane."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
             lane = Lane.STEERING  # it will be refused
@@ -347,7 +347,7 @@ class SharedLocalServer(LocalServer):
             self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
 
     def _is_current(self, reactor: Reactor, source: Source) -> bool:
-        """Return whether this reactor still receives from a source; otherwise pass it on or drop it."""
+        """Return whether this reactor still receives from a source. If not, pass the source on or drop it."""
         if source.ended:
             reactor.remove(source)
             return False
@@ -374,7 +374,7 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # connected while the others were being disconnected
+            if self._stopping.is_set():  # an application that connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:

@@ -1,9 +1,9 @@
 """The proxy's end of the local transport, with one connection and one receiving thread per application.
 
 A dedicated thread in ``recv`` delivers a packet with one system call. Waiting for all connections at once (epoll) needs
-two, which delayed commands by a third more on an idle machine. The threads take turns calling the handler, so that it
-gets one call at a time as the contract requires: those with a command go first, the others in order of arrival. A
-thread whose turn comes late reads all of its waiting packets, and passes on only the newest of the set-points.
+two calls, which delayed commands by a third more on an idle machine. The threads take turns calling the handler, so
+that it gets one call at a time, as the contract requires. Threads with a command go first, the others in order of
+arrival. A thread whose turn comes late reads all its waiting packets, and passes on only the newest of the set-points.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class LocalServer(TransportServer):
         self._directory = find_directory(group)
         self._directory.socket_path(name)  # if the path is too long, raise here rather than on start
         self._exchange = FrameExchange()
-        # These are replaced under the lock, never changed in place, so that any thread may read them.
+        # These are replaced under the lock and never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
         self._peers: dict[int, ServerConnection] = {}  # by the peer's number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
@@ -238,7 +238,7 @@ class LocalServer(TransportServer):
             oldest.hang_up(f"it sent no Hello, so its place at {self.address} went to a newer connection")
             return ""
 
-    # --- the receiving threads ---
+    # --- on the receiving threads ---
 
     def _serve(self, handler: ServerHandler, connection: ServerConnection) -> None:
         """Receive from one application until its connection ends."""
@@ -264,11 +264,11 @@ class LocalServer(TransportServer):
             except OSError as error:
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
-                continue  # handled at once, because a command behind it must not have to wait for it
+                continue  # handled immediately, because a command behind it must not have to wait for it
             lock.acquire(is_command(packet))
             try:
                 more = connection.pilot and poll(0)
-                if more:  # the packet had to wait, so packets that have arrived since may supersede it
+                if more:  # the packet had to wait, so packets that have arrived in the meantime may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
@@ -291,7 +291,7 @@ class LocalServer(TransportServer):
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
         """Handle one packet; return why it ends the connection, or an empty string. The caller holds the lock."""
         if not packet or connection.ending:
-            # An empty packet can't be distinguished from the end of the connection, so it is treated as such.
+            # An empty packet can't be distinguished from the end of the connection, so it is treated as the end.
             return f"the application is gone ({connection.peer.address})"
         if len(packet) > MAX_PACKET:
             return f"it sent a packet of more than {MAX_PACKET} bytes"
@@ -369,7 +369,7 @@ class LocalServer(TransportServer):
 
 
 def _problem(topic: str, subscribed: int) -> str:
-    """Return why an application with that many topics can't subscribe to another existing one; empty if it can."""
+    """Return why an application with that many topics can't subscribe to another existing topic; empty if it can."""
     if topic.startswith(_VIDEO) and "?" in topic:
         return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"
     return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""
