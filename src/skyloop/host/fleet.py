@@ -18,7 +18,7 @@ from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
 HOST: Final = "host"  #: default name of a host
-#: Schemes whose addresses each create a new vehicle, so that two vehicles may have the same address.
+#: Address schemes for which each address creates a new vehicle, so that two vehicles may have the same address.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""The host, which runs any number of vehicles in one process; each can fail, join or leave without affecting others."""
+"""The host. It runs any number of vehicles in one process. Each can fail, join or leave without affecting others."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Host:
         self._make_driver = make
         self._overview = OverviewRegistry()
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
-        self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
+        self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by giving only their name
         self._lock = threading.Lock()  # guards the vehicles and the loops
         self._reactor = Reactor()  # the reactor for vehicles that are added later
         self._ticker = Ticker(self._on_failing)
@@ -102,7 +102,7 @@ class Host:
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
-            # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
+            # The link may be removed as soon as it runs: ``_forget`` stops the ticks of a proxy that has ended.
             if (proxy := vehicle.proxy) is not None and vehicle.runs:
                 self._ticker.add(proxy)
         return vehicle
@@ -120,7 +120,7 @@ class Host:
             self._links.add(link, vehicle)
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
-        """Serve several vehicles, some concurrently; return by name why vehicles failed."""
+        """Serve several vehicles, some of them at the same time. Return the reasons why vehicles failed, by name."""
         problems: dict[str, str] = {}
 
         def add(settings: VehicleSettings) -> None:
@@ -134,7 +134,7 @@ class Host:
         return problems
 
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
-        """Land a vehicle, end its proxy and forget it; return its last status.
+        """Land a vehicle, end its proxy and remove it; return its last status.
 
         Raises :class:`RefusedError`, without removing the vehicle, if the vehicle flies under a lease (code ``flown``)
         and ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
@@ -178,7 +178,7 @@ class Host:
         return ended
 
     def _forget(self, proxy: Proxy) -> None:
-        """Stop ticking a proxy that has ended, and close loops that only it used."""
+        """Stop ticking a proxy that has ended, and close the loops that only this proxy used."""
         with self._lock:
             for loop in self._loops:
                 if isinstance(loop, Ticker):

@@ -1,8 +1,8 @@
-"""A vehicle whose proxy runs in a separate process, which is restarted when it dies.
+"""A vehicle whose proxy runs in a separate process. The process is restarted when it dies.
 
 The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. It ends with its
 host, immediately and without a landing, just like a proxy inside the host's process. Each line of its standard output
-is a status for the host in JSON.
+is a status for the host, in JSON.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from skyloop.transport.local import LocalServer
 
 STARTS_WITHIN_S: Final = 20.0  #: time limit for the first report
 FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; it doubles each time the process dies
-LONGEST_PAUSE_S: Final = 30.0  #: maximum length of that pause
-#: Checks without a report, at four per second, after which the process is considered hung and killed. The watchdog
-#: counts checks rather than seconds, so that a process is not considered hung after its computer was suspended.
+LONGEST_PAUSE_S: Final = 30.0  #: maximum length of the pause before a restart
+#: Number of checks without a report, at four per second, after which the process is considered hung and killed. Checks
+#: are counted rather than seconds, because the computer may have been suspended in the meantime.
 SILENT_CHECKS: Final = 40
 STARTING_CHECKS: Final = 80  #: the same limit for the time before the process has sent its first report
-STEADY_S: Final = 60.0  #: if it ran for this long before it died, a process is restarted after the shortest pause
+STEADY_S: Final = 60.0  #: a process that ran for this long before it died is restarted after the shortest pause
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
@@ -62,10 +62,10 @@ class OwnProcessVehicle(HostedVehicle):
     ) -> None:
         super().__init__(settings)
         self._announce = announce
-        self._changed = threading.Condition()  # guards all of the following
+        self._changed = threading.Condition()  # guards all of the following attributes
         self._reported: VehicleStatus | None = None  # the status that the current process reported
         self._silent_checks = 0  # number of checks since it last sent a report
-        self._deaths = 0  # number of deaths in succession
+        self._deaths = 0  # number of deaths in a row
         self._runner = RestartingChild(
             [*command, settings.name],
             handed=encode_handed(settings).decode(),
@@ -110,7 +110,7 @@ class OwnProcessVehicle(HostedVehicle):
                 self._announce(f"vehicle of {self.settings.name}: running again, process {child.pid}")
 
     def _is_silent(self) -> bool:
-        """Return whether the process has stopped sending reports without having been asked to end."""
+        """Return whether the process has stopped sending reports although no one asked it to end."""
         with self._changed:
             self._silent_checks += 1
             most = STARTING_CHECKS if self._reported is None else SILENT_CHECKS

@@ -1,4 +1,4 @@
-"""The host process run by ``skyloop host fleet.toml``, and its control socket: ``add``, ``remove`` and ``status``.
+"""The host process that ``skyloop host fleet.toml`` runs, and its control socket: ``add``, ``remove`` and ``status``.
 
 Each connection carries one request and one answer in JSON, split into packets. The socket ``NAME.host`` is next to the
 proxies' sockets. The same users can access it: the host's own user, the superuser, and members of the host's group.
@@ -45,7 +45,7 @@ MAX_PACKET: Final = 1 << 16  #: maximum size in bytes
 MAX_ANSWER: Final = 1 << 22  #: maximum size in bytes
 ANSWERS_WITHIN_S: Final = 60.0  #: time for an answer, including the landing before a removal
 _CHUNK: Final = 1 << 15  # size of a packet in bytes
-_AGAIN_S: Final = 0.1  # pause after a failed accept
+_AGAIN_S: Final = 0.1  # pause after accepting a connection has failed
 _SLOW_S: Final = 2.0  # time for the other end to receive or send a packet
 _log = logging.getLogger(__name__)
 
@@ -150,7 +150,7 @@ def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
 
 
 def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
-    """Return a source of updates about the keys for each of the fleet's key folders."""
+    """Return one source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
         with suppress(UsageError, ImportError):  # a vehicle whose key folder can't be used is not served
@@ -171,7 +171,7 @@ class Status(msgspec.Struct, frozen=True, tag="status"):
 
 
 class Add(msgspec.Struct, frozen=True, tag="add"):
-    """Request to serve more vehicles; those already running are left unchanged."""
+    """Request to serve more vehicles. Vehicles that are already running are left unchanged."""
 
     vehicles: tuple[VehicleSettings, ...]
 
@@ -199,8 +199,8 @@ class Answer(msgspec.Struct, frozen=True):
 
     vehicles: tuple[VehicleStatus, ...] = ()  #: all vehicles, or those in the request
     problems: dict[str, str] = {}  #: why vehicles could not be added, by name
-    error: str = ""  #: why nothing was done
-    kind: str = ""  #: class name of that error
+    error: str = ""  #: the reason why nothing was done
+    kind: str = ""  #: class name of the error
     code: str = ""
 
 
@@ -334,7 +334,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
     received = bytearray()
     try:
-        with suppress(BrokenPipeError):  # a refused caller gets its answer before it has sent its whole request
+        with suppress(BrokenPipeError):  # a caller that is refused gets its answer before it has sent its whole request
             _send(sock, encode_handed(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet

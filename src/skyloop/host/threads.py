@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 #: Called on the ticker's thread with the last error and the proxy whose ticks keep failing. It must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
-MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
+MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before other drivers have to wait
 IDLE_THREADS: Final = 2  #: number of threads kept ready for bursts of requests
 _IDLE_S: Final = 5.0  #: a spare thread ends after this time without a job
 
@@ -37,11 +37,11 @@ _LONGEST_WAIT_NS: Final = 1_000_000_000  #: maximum time to wait in the selector
 _MOST_STALE: Final = 4  #: maximum number of queue entries per link; beyond it, stale entries are removed
 CHECK_S: Final = 0.05  #: interval between checks
 STALL_CHECKS: Final = 5  #: 0.25 s: gives other vehicles a new thread before their pilots' silence makes them hover
-HANG_CHECKS: Final = 40  #: 2 s: the vehicle is dropped
+HANG_CHECKS: Final = 40  #: 2 s: the vehicle is given up
 
 
 class Ticker:
-    """Ticks proxies on one thread, from construction to :meth:`close`. A failed tick does not affect other proxies.
+    """Ticks proxies on one thread, from construction until :meth:`close`. A failed tick does not affect other proxies.
 
     Like a :class:`skyloop.transport.local.reactor.Reactor`, it records whose code is running and can be split.
     ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in a row.
@@ -197,7 +197,7 @@ class PooledJobQueue:
         self._workers.schedule(self)
 
     def stop(self, timeout_s: float) -> None:
-        """Wait up to this long [s] for the job in progress; drop the others."""
+        """Wait up to this long [s] for the job in progress. Drop all other jobs."""
         with self._changed:
             self._stopped = True
             self._jobs.clear()
@@ -295,7 +295,7 @@ class Watchdog:
 class LinkThread:
     """Serves links on one thread when they are readable or due, from construction until :meth:`close`.
 
-    One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
+    One thread for all links: with one thread each, most of the time would be spent switching threads. Commands bypass
     it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
     records whose code is running and can be split. ``links``: the initial links, each with the vehicle it belongs to.
     """
@@ -369,7 +369,7 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due, or None if there is none. The caller holds the lock."""
+        """Return the time when the next link is due; None if no link is. The caller holds the lock."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
@@ -414,7 +414,7 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread has taken over since then
+                return  # another thread took over the link in the meantime
             if link in self._paused:
                 self._paused.remove(link)
                 readable = True  # it may be readable, because it was not polled

@@ -31,7 +31,7 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-OPEN_S: Final = 10.0  #: time for a driver to open or close before its vehicle is dropped
+OPEN_S: Final = 10.0  #: time for a driver to open or close before its vehicle is given up
 _log = logging.getLogger(__name__)
 
 
@@ -94,7 +94,7 @@ class HostedVehicle(ABC):
 
     @property
     def runs(self) -> bool:
-        """Return whether the vehicle has a proxy or is about to have one."""
+        """Return whether the vehicle has a proxy or is about to get one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
@@ -186,7 +186,7 @@ class SharedVehicle(HostedVehicle):
             proxy.publisher.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="host")
 
     def fail(self, reason: str) -> bool:
-        """End a vehicle whose driver hangs or fails, and publish an event; return False if it was not running."""
+        """End a vehicle whose driver hangs or fails, and publish an event. Return False if it was not running."""
         with self._life:
             proxy = self.proxy
             if proxy is None or self.condition is not Condition.RUNNING:
@@ -243,7 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run a function that may hang on a separate thread, and raise its exceptions on this one.
 
-    Returns whether the call returned in time. Otherwise, the daemon thread keeps running.
+    Returns whether the call returned in time. Otherwise, the daemon thread continues to run.
     """
     raised: list[BaseException] = []
 

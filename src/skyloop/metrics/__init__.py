@@ -1,6 +1,6 @@
 """Metrics of proxies, the cockpit and routers for Prometheus, collected only when they are scraped.
 
-They can be read on any thread, without taking any lock that a command waits for. Requires the ``metrics`` extra.
+They can be read on any thread, without acquiring any lock that a command waits for. Requires the ``metrics`` extra.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported
-#: as 0, except those of a network that is not served.
+#: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Counters that are absent are
+#: exported as 0, except those of a network that is not served.
 _COUNTERS: Final = (
     *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
     *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
     *("events.missed", "driver.errors"),
 )
 _NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
-#: Counters whose name contains a label: the parts of the name before and after it.
+#: Counters whose name contains a label. Given are the parts of the name before and after the label.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
     "skyloop_events_total": ("events.of.", ""),

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity, KeyRing
 
-MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
-#: Connections allowed per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
+MAX_CLIENTS: Final = 256  #: maximum number of connections; each costs memory, and time on the handler's thread
+#: Connections allowed per key. A program needs one per drone. A lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
 #: Connections reserved for keys that may fly this drone, so that any number of other keys can't lock pilots out.
 FOR_PILOTS: Final = 64
@@ -149,5 +149,5 @@ class Tokens:
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:
-        """Return whether there is a token for any of these connections, given with their identities."""
+        """Return whether there is a token for any of these connections, which are given with their identities."""
         return any(self.has(who, connection) for connection, who in connections.items())

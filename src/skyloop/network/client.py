@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues with another session
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
-#: ended before they were re-established: it then mistakes the new links for additional ones and announces nothing on
+#: ended before they were re-established. It then mistakes the new links for additional links and announces nothing on
 #: them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
@@ -84,7 +84,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             renew(session)
             release(session)
             raise
-        except NoAnswerError:  # the same cause: the links may have been re-established since the session was opened
+        except NoAnswerError:  # same cause: the links may have been re-established since the session was opened
             list_s = min(2.0 * list_s, SYNC_S)
             retire(session)
             release(session)
@@ -242,13 +242,13 @@ class FabricClient(TransportClient):
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
         self._keys_s = 0.0  # time of the next check of the keys
-        self._admission = Admission()  # with keys: the proxy's identity, and seals for the packets
+        self._admission = Admission()  # with keys: the proxy's identity, and the seals for packets
         self.forged = 0  #: number of packets and frames that did not come from the proxy
-        self._receiver = Receiver()  # packets for this end only
+        self._receiver = Receiver()  # packets that are only for this end
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
         self._ended = False  # nothing more can be sent
         self._closing = False  # this end has closed the connection: nothing more is delivered
-        self._farewell = threading.Event()  # set when the proxy has answered our bye, or is gone
+        self._farewell = threading.Event()  # set when the proxy has answered our bye, or has ended
         self._reason = ""
         self._held: list[Any] = []
         try:
@@ -313,7 +313,7 @@ class FabricClient(TransportClient):
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
-        if not sent:  # nothing would arrive on this connection; the next one subscribes again
+        if not sent:  # nothing would arrive on this connection; the next connection subscribes again
             self._end(f"the proxy accepts no packets: the subscription to {topic!r} can't be sent")
 
     def close(self) -> None:
@@ -393,7 +393,7 @@ class FabricClient(TransportClient):
         try:
             opened = contents(self._admission.opener, sample)
             if opened is None:
-                return  # already received on another path
+                return  # the packet was already received by another path
             packet, number = opened[0], packets.parse_number(opened[1])
         except DecodeError as error:
             self._reject(error)
@@ -469,7 +469,7 @@ class FabricClient(TransportClient):
     # --- the end of the connection ---
 
     def _end(self, reason: str) -> None:
-        """End the connection, once; the receiving thread does the rest. Any thread."""
+        """End the connection. Only the first call counts, and the receiving thread does the rest. Any thread."""
         with self._lock:
             if self._ended:
                 return
@@ -534,7 +534,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet; ``once``: in a datagram, which may be lost."""
+        """Acknowledge a packet. ``once``: in a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return

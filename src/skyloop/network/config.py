@@ -1,6 +1,6 @@
 """Read network settings from arguments and the environment, and create Zenoh's configuration from them.
 
-Pure, except for reading the environment and finding a free port.
+A pure function, except that it reads the environment and finds a free port.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ MAX_LEASE_S: Final = 10.0  #: longest lease that can be set
 DEFAULT_PORT: Final = 7447  #: Zenoh's default port
 #: Time for an address to answer before the peer's next address is tried.
 OPEN_MS: Final = 800
-#: The same for addresses given explicitly: all are tried at once, and one may lead to a mobile network, where answers
-#: after an outage are stuck behind old video. An end that gives up just before the last answer leaves a half-open link
-#: at the far end; Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
+#: The same for addresses that were given explicitly. All are tried at once, and one may lead to a mobile network, where
+#: answers after an outage are queued behind old video. An end that gives up just before the last answer leaves a
+#: half-open link at the other end. Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits to discover others (Zenoh's default). An application with a single address waits
-#: only for the proxy at that address; one with several must find every proxy with the name.
+#: How long a session waits to discover others when it is opened (Zenoh's default). An application with one address
+#: waits only for the proxy at that address. With several addresses, it must find every proxy with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
 #: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
@@ -187,7 +187,7 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
+    """Create network settings. ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
     endpoints_of((*listen, *connect), found)  # reports invalid addresses before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
@@ -220,12 +220,12 @@ class Part(StrEnum):
     ROUTER = "router"  #: joins ends that can't reach one another directly
 
 
-#: Signs of life per lease: enough for some to arrive on a path that loses three packets in ten.
+#: Number of keep-alive packets per lease. It is enough for some to arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
-#: Number of messages queued for sending at each priority (Zenoh's maximum). Zenoh's default of 2 drops further ones
+#: Number of messages queued for sending at each priority (Zenoh's maximum). Zenoh's default of 2 drops further messages
 #: within a millisecond, and ten drones in one process can report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Override what a neighbour requests, so that no slow reader blocks another, neither here nor through a router. Answers
+#: Override what a neighbour requests, so that no slow reader blocks another, either here or through a router. Answers
 #: travel in the same way as the queries.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
@@ -308,7 +308,7 @@ def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str
 
 
 def to_json(sections: dict[str, Any]) -> str:
-    """Return a configuration as JSON, for Zenoh's own programs."""
+    """Return a configuration as JSON, in the form that Zenoh's own programs read."""
     return json.dumps(sections, indent=2)
 
 
@@ -344,8 +344,8 @@ def free_port(host: str) -> int:
 def _called(part: Part, has_addresses: bool) -> list[str]:
     """Return the kinds of nodes to connect to when they are discovered.
 
-    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node that was given
-    addresses connects to no other routers, because a discovered router is not retried as often as an address.
+    Only applications connect to proxies, so a hundred proxies have no links to one another. A node that was given
+    addresses connects to no other routers, because a discovered router is not retried as often as a given address.
     """
     if part is Part.APP:
         return ["router", "peer"]

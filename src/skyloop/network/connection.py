@@ -1,4 +1,4 @@
-"""The connections of applications at a transport server, and a thread that sends to individual ones.
+"""The connections of applications at a transport server, and a thread that sends to individual applications.
 
 Threads that answer an application only queue the answer here. The sending thread never waits for an application. An
 application that acknowledges nothing uses a bounded amount of memory.
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 #: acknowledged and are therefore resent. Further commands are dropped, as newer ones follow. Set-points count as one.
 MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
-_OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are requested again
+_OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are then requested again
 _log = logging.getLogger(__name__)
 _VIDEO: Final = video("")
 _STREAMS: Final = stream("")
@@ -57,11 +57,11 @@ class ServerConnection:
         self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to the application
         self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
         self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged frame
-        self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet counts
-        self.left = False  #: the application has unsubscribed from everything for good
+        self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet matters
+        self.left = False  #: the application has unsubscribed for good from every topic
 
     def may_command(self, drone: str) -> bool:
-        """Return whether the application's proven identity permits more than queries to this drone."""
+        """Return whether the application's proven identity permits more than queries about this drone."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 
@@ -70,7 +70,7 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet the application has acknowledged a topic, or (if empty) packets to it alone.
+        """Record which packets of a topic, or (if empty) of those to it alone, the application has acknowledged.
 
         Returns whether more packets that go only to this application may be waiting.
         """
@@ -137,7 +137,7 @@ class Sender:
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Schedule the sending of a connection's due packets. Any thread."""
+        """Schedule the sending of the packets that are due on a connection. Any thread."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()
@@ -183,7 +183,7 @@ class Publisher:
         self._run = bytes.fromhex(run)
         self._sealer = sealer
         self._clock = clock
-        self.held_back = 0  #: number of packets skipped because all subscribers were silent
+        self.held_back = 0  #: number of packets that were skipped because all subscribers were silent
         self._lock = threading.RLock()  # guards the following attributes
         self._session: Session | None = None  # set while publishing is possible
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
@@ -241,7 +241,7 @@ class Publisher:
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
+        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))

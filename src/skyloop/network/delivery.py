@@ -1,8 +1,8 @@
-"""Deliver numbered packets exactly once and in order, even if some are lost on the way.
+"""Deliver numbered packets exactly once and in order, even if some of them are lost on the way.
 
-The number of packets in flight is bounded. Time is passed as an argument, and sending is left to the callers.
+The number of packets in flight is limited. Time is passed as an argument, and sending is left to the callers.
 
-Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router; it also drops
+Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router. It also drops
 packets that reach a node before the subscription does. Each numbered packet is therefore kept and resent until the
 other end acknowledges it. Only a few frames are in flight at once, to avoid congesting a slow path.
 """
@@ -19,7 +19,7 @@ from typing import Final
 from skyloop.network import packets
 
 DEPTH: Final = 256  #: maximum number of unacknowledged packets to one end; further packets are refused
-MAX_BYTES: Final = 1 << 20  #: size of unacknowledged packets to one end before further ones are refused [bytes]
+MAX_BYTES: Final = 1 << 20  #: total size of unacknowledged packets to one end; further packets are refused [bytes]
 RECENT_PACKETS: Final = 64  #: number of recent packets that are remembered to detect repeats
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets
 #: Number of packets in flight. Zenoh queues as many per link before it drops one (``config._QUEUES``).
@@ -37,7 +37,7 @@ class _Packet:
     number: int
     data: bytes
     way: str
-    sent_s: float = 0.0  #: when the packet was last sent; 0: not yet
+    sent_s: float = 0.0  #: time when the packet was last sent; 0 if it has not been sent
 
 
 class Outgoing:
@@ -52,7 +52,7 @@ class Outgoing:
         self._under_way_bytes = 0
         self._next = 1
         self._again_s = AGAIN_S
-        self._headway_s = 0.0  # when the other end last acknowledged a packet, or when an idle path got its first one
+        self._headway_s = 0.0  # time when the other end last acknowledged a packet, or an idle path got its first one
 
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
         """Keep another packet, sent by the key ``way``, until it is acknowledged; return False if there is no room.
@@ -117,7 +117,7 @@ class Incoming:
     """Reorders the numbered packets from the other end's :class:`Outgoing`. Not thread-safe."""
 
     def __init__(self) -> None:
-        self.taken = 0  #: number up to which all packets have arrived, to be acknowledged
+        self.taken = 0  #: number up to which all packets have arrived; it is sent as an acknowledgement
         self._early: dict[int, bytes] = {}
 
     def take(self, number: int, packet: bytes) -> list[bytes]:
@@ -135,7 +135,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when a subscriber acknowledges a topic's packets, within ``every_s`` [s]. Not thread-safe."""
+    """Decides when to acknowledge a topic's packets: within ``every_s`` [s] of their arrival. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0
@@ -167,7 +167,7 @@ class Pace:
     def __init__(self) -> None:
         self._newest = self._acknowledged = 0  # packet numbers
         self._eager = False  # the other end acknowledges more often than it must, so silence means a loss
-        self._sent_s = -math.inf  # when the newest packet was sent
+        self._sent_s = -math.inf  # time when the newest packet was sent
         self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
     def may_send(self, now_s: float) -> bool:
@@ -181,7 +181,7 @@ class Pace:
         self._since_s = min(self._since_s, now_s)
 
     def taken(self, number: int, now_s: float) -> None:
-        """Record an acknowledgement up to this number; ignore a number that has not been sent yet."""
+        """Record that packets up to this number were acknowledged. Ignore a number that has not been sent yet."""
         if not self._acknowledged < number <= self._newest:
             return
         self._eager = self._eager or (self._acknowledged > 0 and number - self._acknowledged < ACKNOWLEDGE_AFTER)
@@ -196,7 +196,7 @@ class RecentPackets:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
 
     def is_new(self, number: int, packet: bytes) -> bool:
-        """Return whether a packet is not among the latest ones, and remember it."""
+        """Return whether a packet is not among the latest packets, and remember it."""
         if (number, packet) in self._packets:
             return False
         self._packets.append((number, packet))
@@ -206,8 +206,8 @@ class RecentPackets:
 class Receiver:
     """Receives packets at one end of a connection: numbered packets exactly once and in order, all others at most once.
 
-    The transport's own packets are passed to ``control``, which returns whether it handled them; unhandled and all
-    other packets are passed to ``deliver``. Thread-safe. One thread at a time passes on numbered packets.
+    The transport's own packets are passed to ``control``, which returns whether it handled them. All others are passed
+    to ``deliver``. Thread-safe. One thread at a time passes on numbered packets.
     """
 
     def __init__(self) -> None:

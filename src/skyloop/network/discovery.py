@@ -1,4 +1,4 @@
-"""Discovery: list the network's proxies, find one that comes back, and join one.
+"""Discovery: list the network's proxies, find a proxy that comes back, and join a proxy.
 
 Zenoh retries the addresses that it was given, but repeats its multicast search only after 1, 2, 4 and then every 8
 seconds. An application that does not find a proxy therefore searches here, without a connection. If a node answers that
@@ -144,7 +144,7 @@ class UnreachablePeers:
         return bool(new)
 
     def clear(self) -> None:
-        """Forget the peers: after a proxy was reached, earlier failures say nothing about the next attempt."""
+        """Forget the peers: once a proxy has been reached, earlier failures say nothing about the next attempt."""
         self._tried.clear()
 
 
@@ -172,7 +172,7 @@ def renew(session: Session) -> bool:
 
 
 def _search(session: Session) -> set[str]:
-    """Return the identities of the nodes that answer now and accept connections."""
+    """Return the identities of the nodes that currently answer and accept connections."""
     answered: set[str] = set()
 
     def hello(answer: Any) -> None:
@@ -221,7 +221,7 @@ class ProxyWatch:
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
         if not found:
-            # A node flooded with tokens may list many others before the proxy's token, so wait for all of them.
+            # A node that is flooded with tokens may list many others before the proxy's token, so wait for all of them.
             known, complete = listed(self._session, within_s=list_s)
             with self._changed:
                 self._runs.update(run for other, run in known if other == self._name)

@@ -34,7 +34,7 @@ from skyloop.transport.base import FEEDBACK, NAME
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO if there are no keys
-PLAIN: Final = "-"  #: the variant with a camera's unchanged frames
+PLAIN: Final = "-"  #: the variant that contains a camera's unchanged frames
 #: Valid identities: one chunk of a key, without wildcards.
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
@@ -49,7 +49,7 @@ ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinPr
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
 _REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, so that garbage keeps its place in the order
-_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need these to fly
+_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need poses to fly
 
 
 class Sender(NamedTuple):
@@ -115,7 +115,7 @@ def video_for(name: str, camera: str, variant: str, connection: str) -> str:
 
 
 def downward(name: str) -> tuple[str, str, str]:
-    """Return expressions for all keys by which a proxy sends packets and frames."""
+    """Return expressions for all keys that a proxy uses to send packets and frames."""
     return to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"
 
 

@@ -31,12 +31,12 @@ class FabricKind(IntEnum):
     SUBSCRIBE = 0x50  #: application to proxy
     TAKEN = 0x51  #: either direction: all packets up to this number were received
     SEEN = 0x52  #: application to proxy: frames up to this number were received
-    BYE = 0x53  #: either direction: why the connection ends; answered with a BYE
+    BYE = 0x53  #: either direction: the reason why the connection ends; answered with a BYE
     KEY = 0x54  #: proxy to application, sealed: the new key for topics and frames
 
 
 class Subscribe(NamedTuple):
-    """Subscribes an application to a topic, or unsubscribes it."""
+    """Subscribes an application to a topic, or ends the subscription."""
 
     topic: str
     on: bool
@@ -84,7 +84,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     """An application's request to join, as MessagePack."""
 
     revision: int
-    run: str  #: run of the proxy that the request is meant for
+    run: str  #: the run of the proxy that the request is meant for
     host: str = ""  #: shown to users
     pid: int = 0  #: shown to users
     program: str = ""  #: shown to users
@@ -196,7 +196,7 @@ def _topic(text: bytes, least: int = 0) -> str:
 
 
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
-    """Return a copy of bytes received by Zenoh, unless they exceed the maximum size; empty for None."""
+    """Return a copy of bytes that Zenoh received, unless they exceed the maximum size; empty for None."""
     if data is None:
         return b""
     if len(data) > at_most:
@@ -205,7 +205,7 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
-    """Return a sample's packet, which must not be empty or too large, and its attachment."""
+    """Return the packet in a sample, which must not be empty or too large, and its attachment."""
     if not sample.payload:
         raise DecodeError("it is empty")
     return copied(sample.payload, at_most), copied(sample.attachment, MAX_OWN)

@@ -1,6 +1,6 @@
 """Manage a proxy's connections: admit applications and end connections.
 
-A connection is ended if its application is gone, has lost its rights, or acknowledges nothing.
+A connection is ended if its application has ended, has lost its rights, or acknowledges nothing.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class ConnectionRegistry:
         return True
 
     def stray(self, key: str) -> None:
-        """Count a packet without a connection, given the key on which it arrived."""
+        """Count a packet without a connection, given the key that it arrived on."""
         self.strays += 1
         if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive after it has left
             self._stray_commands += 1
@@ -131,7 +131,7 @@ class ConnectionRegistry:
     # --- callbacks, on Zenoh's threads ---
 
     def on_token(self, sample: zenoh.Sample) -> None:
-        """Record that an application's token appeared or disappeared. Called on Zenoh's threads."""
+        """Record that an application's token has appeared or disappeared. Called on Zenoh's threads."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
         except DecodeError:
@@ -189,7 +189,7 @@ class ConnectionRegistry:
             if not self._open:
                 return "the proxy is about to stop"
             if sender.id in self._connections:
-                before = self._connections[sender.id]  # the request was repeated, or arrived on two paths
+                before = self._connections[sender.id]  # the request was repeated, or arrived by two paths
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
@@ -334,7 +334,7 @@ class ConnectionRegistry:
 
 
 class _TurnQueue(Generic[T]):
-    """One queue per connection; the connections take turns, so that one with many items doesn't delay the others."""
+    """One queue per connection. They take turns, so that one with many items doesn't delay the others."""
 
     def __init__(self) -> None:
         self._order: deque[Hashable] = deque()
@@ -379,7 +379,7 @@ class HandlerQueue(Generic[T]):
         self._closed = False
 
     def put(self, of: Hashable, item: T, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue a connection's item, urgent ones first; refuse it if ``at_most`` are waiting. Any thread."""
+        """Queue a connection's item, urgent items first. Refuse it if ``at_most`` are waiting. Any thread."""
         with self._changed:
             queue = self._urgent if urgent else self._others
             if at_most is not None and queue.count(of) >= at_most:
@@ -394,7 +394,7 @@ class HandlerQueue(Generic[T]):
             return self._others.count(of)
 
     def close(self) -> None:
-        """Stop :meth:`get` from waiting; it still returns items already queued."""
+        """Stop :meth:`get` from waiting. It still returns items that are already queued."""
         with self._changed:
             self._closed = True
             self._changed.notify()

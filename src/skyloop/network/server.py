@@ -55,7 +55,7 @@ class FabricServer(TransportServer):
         ring = self._settings.ring
         topic_keys = None if ring is None else TopicSeal()
         self._commands_lock = threading.Lock()  # guards the connections' backlogs of commands
-        self._superseded = 0  # number of queued commands that newer ones have superseded
+        self._superseded = 0  # number of queued commands that newer commands have superseded
         self._queue: HandlerQueue[Item] = HandlerQueue()
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
@@ -213,7 +213,7 @@ class FabricServer(TransportServer):
                 return
             opened = contents(connection.admission.opener, sample)
             if opened is None:
-                return  # already received on another path
+                return  # the packet was already received by another path
             packet, attachment = opened
             number = packets.parse_number(attachment)
         except DecodeError:
@@ -249,7 +249,7 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # otherwise the packet takes the turn of the one it replaces
+        if not superseded:  # otherwise the packet takes the turn of the packet that it replaces
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
@@ -308,12 +308,12 @@ class FabricServer(TransportServer):
             handler.refused(connection.peer, "it sent a packet that its keys do not allow")
             return
         message = packets.parse_own(packet)
-        if isinstance(message, packets.Subscribe):  # subscribing had failed
+        if isinstance(message, packets.Subscribe):  # the earlier subscription had failed
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
 
 
 def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
-    """Return a proxy's end for both this host and the network; other arguments are those of :class:`FabricServer`."""
+    """Return a proxy's end for both this host and the network. The other arguments are :class:`FabricServer`'s."""
     return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

@@ -1,4 +1,4 @@
-"""This process's Zenoh sessions: connections with the same settings share one, for any number of drones."""
+"""This process's Zenoh sessions. Connections with the same settings share one, for any number of drones."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Session:
         self.settings = settings
         self.part = part
         self.users = 0
-        self.retired = False  #: not given to new users, because there is a better one
+        self.retired = False  #: not given to new users, because there is a better session
         self.idle_since = 0.0
         self.opened = time.monotonic()
         self.listens: list[str] = []  #: network addresses that it listens on
@@ -54,7 +54,7 @@ class Session:
         return Callback(function, indirect=False)
 
     def put(self, key: str, payload: bytes, attachment: bytes, priority: Priority) -> None:
-        """Send a packet; it is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
+        """Send a packet. It is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
         z = load()
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
@@ -118,7 +118,7 @@ class _Pool:
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
-        self._closing = 0  # number of sessions that are being closed and no longer in the list
+        self._closing = 0  # number of sessions that are being closed and are no longer in the list
         self._over = False  # the process is exiting
         self._reaper: threading.Thread | None = None
 
@@ -138,7 +138,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
+        """Return a session. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -217,7 +217,7 @@ atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:
-    """Import the package zenoh and return it; without it, raise :class:`MissingExtraError`."""
+    """Import the package ``zenoh`` and return it. Raises :class:`MissingExtraError` if it is not installed."""
     try:
         import zenoh
     except ImportError as error:
@@ -233,8 +233,8 @@ def host_name() -> str:
 def renewed(session: Session) -> Session:
     """Replace a session that has no other users with a session at the same addresses that uses the newest roster.
 
-    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or if an address
-    does not become free again within :data:`REOPEN_S`.
+    All links of the session are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or if an
+    address does not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)
@@ -272,7 +272,7 @@ def configure(sections: dict[str, Any]) -> zenoh.Config:
 
 
 def _leaves(path: str, value: Any) -> list[tuple[str, Any]]:
-    """Split sections so that missing values keep their defaults; some can only be set as a whole."""
+    """Split sections so that missing values keep their defaults. Some sections can only be set as a whole."""
     if isinstance(value, dict) and not path.endswith(("access_control", "autoconnect", "gateway", "retry")):
         return [leaf for key, inner in value.items() for leaf in _leaves(f"{path}/{key}" if path else key, inner)]
     return [(path, value)]

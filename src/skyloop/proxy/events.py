@@ -1,7 +1,7 @@
 """What a proxy reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, followed by the pure functions that create its input, the event drafts: those about commands,
-failsafe and ownership, then those about the authority.
+The publisher comes first, followed by the pure functions that create the event drafts for it: first those about
+commands, failsafe and ownership, then those about the authority.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class EventPublisher:
         self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
-        self.last: Event | None = None  #: the newest event, not counting applications that connect or disconnect
+        self.last: Event | None = None  #: the newest event that is not an application's connection or disconnection
 
     def publish(
         self,
@@ -111,7 +111,7 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # if this event is lost, no other event reports that
+                self._missed = 0  # if this event is lost, no other event reports the change
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
         """Number events and publish them. The caller holds the lock."""
@@ -145,7 +145,7 @@ class EventPublisher:
 
 @dataclass(slots=True)
 class EventDraft:
-    """An event without its number and time."""
+    """An event that has no number or time yet."""
 
     kind: EventKind
     text: str
@@ -268,7 +268,7 @@ def emergency_event(name: str) -> EventDraft:
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """Return the event for a failsafe step that began or ended."""
+    """Return the event for the start or end of a failsafe step."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO

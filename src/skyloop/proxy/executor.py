@@ -56,7 +56,7 @@ class ActionExecutor:
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
-        self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears and raises it
+        self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears it and raises it
         self._publisher = publisher
         self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; cleared by the reader
 
@@ -106,7 +106,7 @@ class ActionExecutor:
             self.autopilot.stop("idle")
 
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Execute a supported action, and return what was actually applied. Raises the driver's errors.
+        """Execute a supported action, and return the action that was actually applied. Raises the driver's errors.
 
         ``new``: whether it is a new request of the application rather than a repeat. Raises :class:`RefusedError` if
         the vehicle certainly won't follow commands in its present state.
@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently. No further commands are sent.
 
-        A vehicle without a native hover is also stopped, as far as a single set-point can do that.
+        If it has no native hover, a vehicle is also stopped, as far as a single set-point can do that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -176,7 +176,7 @@ class ActionExecutor:
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
-        """Let the software autopilot, if it is on, send its next set-point; return what the driver applied."""
+        """If the software autopilot is on, let it send its next set-point. Return what the driver applied."""
         if self.autopilot is None:
             return None
         action = self.autopilot.step(now_ns, self._shown(now_ns), self._publisher.reported_state)
@@ -208,7 +208,7 @@ class ReturnSupervisor:
         self._ladder = ladder
         self._executor = executor
         self._problem = ""  # reason why the ladder's return flight can't continue
-        self._good_ns = 0  # when the return was last able to continue
+        self._good_ns = 0  # last time at which the return could continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
         """Start the ladder's return; :meth:`update` continues it."""
@@ -236,7 +236,7 @@ class ReturnSupervisor:
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't fly back to the start; empty if it can, or does not need to."""
+        """Return why the ladder can't fly back to the start; empty if it can or does not need to."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem

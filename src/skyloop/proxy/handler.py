@@ -50,7 +50,7 @@ from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
-#: Echo of a command that had no new effect because it was refused or held.
+#: Echo of a command that had no new effect because it was refused or already in effect.
 _NOTHING: Final = Idle()
 
 
@@ -71,7 +71,7 @@ class CommandHandler(FlightSupervisor):
     """Handles applications' requests to one vehicle. Public methods are thread-safe."""
 
     def configure(self, settings: FlightSettings) -> None:
-        """Apply new parameter values. Unchanged settings are the same objects as before."""
+        """Apply new parameter values. Settings that have not changed are the same objects as before."""
         with self._lock:
             airspace, space = self.checks.airspace, settings.airspace.space
             if space is not airspace.settings.space:
@@ -94,7 +94,7 @@ class CommandHandler(FlightSupervisor):
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return a readable reason not to write a momentary parameter, such as a flip, now; empty if there is none."""
+        """Return a readable reason why a momentary parameter, such as a flip, can't be written now; empty if it can."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
@@ -108,7 +108,7 @@ class CommandHandler(FlightSupervisor):
     def order_landing(self, now_ns: int) -> bool:
         """Land because the proxy is about to end. From now on, accept only landings and emergency stops.
 
-        Returns whether the proxy has a flight, or one may be about to begin.
+        Returns whether the proxy has a flight, or a flight may be about to begin.
         """
         with self._lock:
             self.ladder.order_landing()
@@ -160,7 +160,7 @@ class CommandHandler(FlightSupervisor):
             effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
             self._apply_authority(effects, now_ns)
             holder = authority.holder
-            assert holder is not None  # after a request there is always a holder
+            assert holder is not None  # after a request, there is always a holder
             if holder.app_id == app_id:
                 return AuthorityGranted(authority.lease, authority.until_ns or 0)
             name, position = name_of(self._sessions, holder.app_id), authority.position(app_id)
@@ -222,7 +222,7 @@ class CommandHandler(FlightSupervisor):
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Return what was applied and when; for a refused command, when it was received."""
+        """Return what was applied and when. For a refused command, return when it was received."""
         # On a machine that was idle, as is usual before a command, each function call costs microseconds. Ordinary
         # commands are therefore received, judged and executed here. Error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
@@ -276,7 +276,7 @@ class CommandHandler(FlightSupervisor):
                 if decision.clamps:
                     self._counts["commands.clamped"] += 1
             try:
-                begins = new or (fresh and decision.takes_off)  # this includes a take-off repeated by a waiting call
+                begins = new or (fresh and decision.takes_off)  # this includes a take-off that a waiting call repeats
                 applied = self._executor.execute(decision.action, now_ns, new=begins)
             except RefusedError as error:
                 self._stop_before(kind, now_ns)
@@ -305,7 +305,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after a new command from an application, or if no one else is flying the vehicle."""
+        """Attribute the flight to the proxy after an application's new command, or if no one else flies."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -317,7 +317,7 @@ class CommandHandler(FlightSupervisor):
             self.on_ownership(True)
 
     def _stop_before(self, kind: type[Action], now_ns: int) -> None:
-        """Hover after a refused set-point, once the driver accepts it, so that the previous one does not continue."""
+        """Hover after a refused set-point, once the driver accepts it. The previous one must not continue."""
         moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
         if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
             self.ladder.hand_over(now_ns)

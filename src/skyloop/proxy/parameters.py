@@ -170,7 +170,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number to write, alone or in a vector, checked to be finite and within the range."""
+    """Return a number to write, alone or in a vector, after checking that it is finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -270,7 +270,7 @@ class Parameters:
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Set values for the proxy's own parameters before it starts; :meth:`write_presets` writes the vehicle's."""
+        """Set the proxy's own parameters before it starts; :meth:`write_presets` sets the vehicle's."""
         for name, value in check_presets(values).items():
             self._own[name] = msgspec.structs.replace(self._own[name], value=value)
             self._presets[name] = value
@@ -278,7 +278,7 @@ class Parameters:
             self._apply(OWN)
 
     def write_presets(self) -> list[tuple[str, str]]:
-        """Write presets to the vehicle's parameters; return which ones failed, with reasons."""
+        """Write presets to the vehicle's parameters. Return which presets failed, with the reasons."""
         problems = []
         for name in [name for name in self._presets if name in self._driver]:
             try:
@@ -286,7 +286,7 @@ class Parameters:
             except Exception as error:  # noqa: BLE001  a driver may raise anything; it is retried on the next occasion
                 problems.append((name, str(error)))
             else:
-                del self._presets[name]  # from here on, pilots may change it
+                del self._presets[name]  # pilots may change it from now on
         return problems
 
     def refresh(self) -> None:

@@ -70,7 +70,7 @@ from skyloop.transport.base import Peer, TransportServer
 MAX_NAME: Final = 64  #: maximum number of characters in a proxy's name
 
 _POLL_S: Final = 0.2
-_ABANDON_S: Final = 1.0  #: how long ending a proxy waits for its other parts if the driver hangs
+_ABANDON_S: Final = 1.0  #: time to wait for the proxy's other parts to end if the driver hangs
 _log = logging.getLogger(__name__)
 
 
@@ -233,9 +233,9 @@ class Proxy:
     ) -> bool:
         """End the flight, then the proxy, and release all resources. Idempotent. Must not be called by the driver.
 
-        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
-        flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it is
-        left hovering if it can hover without the proxy. Otherwise it gets a final set-point of zero speed.
+        First, everything except landings and emergency stops is refused permanently, whether or not the vehicle is
+        flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it
+        is left hovering if it can hover without the proxy. Otherwise it gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
         without the proxy is still landed, however much time has passed, because it would fall otherwise. With
@@ -325,7 +325,7 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, whose name and role are unknown until its Hello."""
+        """Handle a new connection. Its name and role are unknown until its Hello."""
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
@@ -374,7 +374,7 @@ class Proxy:
         )
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to, or an empty string if it can be."""
+        """Return why a topic can't be subscribed to, or an empty string if it can."""
         return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -393,7 +393,7 @@ class Proxy:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
-        if self._stopping.is_set():  # all applications are leaving, and the driver may be closed already
+        if self._stopping.is_set():  # all applications are leaving, and the driver may already be closed
             self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
@@ -432,7 +432,7 @@ class Proxy:
         self.overview.tick(now_ns)
 
     def tick_flight(self, now_ns: int) -> None:
-        """Do the part of :meth:`tick` that a flight needs 50 times a second; the rest may run less often."""
+        """Do the part of :meth:`tick` that a flight needs 50 times a second. The other parts may run less often."""
         if self._stopping.is_set():
             return
         self.handler.tick(now_ns)

@@ -79,9 +79,9 @@ class VehiclePublisher:
         self.reported_state = FlightState.UNKNOWN  #: the state reported by the driver, without the software autopilot
         self.link_state = LinkState.CONNECTING
         self.link_reason = ""  #: what the link is waiting for, and its last failure
-        self.link_remedy = ""  #: what a person can do about it
+        self.link_remedy = ""  #: what a person can do about the problem
         self.link_up = False
-        self.link_breaks = 0  #: number of times the link went down or came back
+        self.link_breaks = 0  #: number of times that the link went down or came back
         self.state_of = state_of
         self.variants = FeedbackVariants(server, counters, clock)
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
@@ -89,7 +89,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # the same as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -120,7 +120,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def _finite(self, raw: Feedback) -> Feedback:
-        """Return feedback with NaN and infinite numbers replaced by unknown, so that readers need not handle them."""
+        """Return feedback with NaN and infinite numbers replaced by None, so that readers need not handle them."""
         vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
         total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
         total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
@@ -210,7 +210,7 @@ class VehiclePublisher:
         )
 
     def overview(self, name: str, uri: str, event: Event | None, *, applications: int) -> VehicleOverview:
-        """Return the vehicle's row in the overview; ``event``: the newest event."""
+        """Return the vehicle's row in the overview. ``event``: the newest event."""
         known = self.feedback_now or Feedback(captured_ns=0)
         return VehicleOverview(
             name=name,
@@ -312,7 +312,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a frame as encoded by the vehicle."""
+        """Publish a frame as the vehicle encoded it."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -342,7 +342,7 @@ class VehiclePublisher:
     # Link and events -------------------------------------------------------------------------------------------
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Publish a change of the vehicle link at once; the flight reacts at its next step."""
+        """Publish a change of the vehicle link immediately. The flight reacts at its next step."""
         reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
@@ -378,7 +378,7 @@ class VehiclePublisher:
         return self._scrub(f"the driver failed: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
-        """Return the text for the sender of a command that made the driver raise; also publish unexpected errors."""
+        """Return the text for the sender of a command that made the driver raise. Publish unexpected errors, too."""
         if isinstance(error, SkyloopError):  # the reason that the vehicle gave
             self._counts["driver.errors"] += 1
             return self._scrub(str(error))

@@ -1,11 +1,11 @@
-"""Write a proxy's files, each on a separate thread: the audit trail, and the note about its flight.
+"""Write a proxy's files, each on a separate thread: the audit trail, and the note about the proxy's flight.
 
 The audit trail records who flew when, as one JSON object per line. Lines are only appended. ``docs/sharing.md``
 describes it. :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
 The note records that a flight belongs to this proxy, so that a proxy that was killed and restarted ends its own flight.
 It is written when a flight becomes the proxy's, and refreshed during the flight. It is removed when the flight is over,
-is someone else's, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
+is someone else's, or can no longer turn up. It is valid for :data:`LIFE_S`. After that time, others may have taken off.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _MODE: Final = 0o600
 #: How long a note is valid. Supervisors restart a proxy within seconds, before another pilot takes over.
 LIFE_S: Final = seconds(BELIEF_NS)
 KEEP_S: Final = 2.0  #: how often the note is refreshed
-MAX_BYTES: Final = 4096  #: maximum length of an address; a longer file is not ours
+MAX_BYTES: Final = 4096  #: maximum length of an address; a longer file can't be ours
 NOTE_SUFFIX: Final = ".flight"
 
 _log = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class AuditTrail:
             self._queue.put(entry)
 
     def close(self) -> None:
-        """Write the remaining lines, within :data:`CLOSE_S`."""
+        """Write the remaining lines. This takes at most :data:`CLOSE_S`."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
 
@@ -209,7 +209,7 @@ def record_path(name: str) -> Path:
 class FlightRecord:
     """The file that holds one proxy's flight record. A separate thread writes it from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored; ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored. ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:
@@ -239,7 +239,7 @@ class FlightRecord:
         self._thread.start()
 
     def set(self, ours: bool) -> None:
-        """Record whether the flight is this proxy's. Thread-safe. Never waits."""
+        """Record whether the flight belongs to this proxy. Thread-safe. Never waits."""
         if ours is not self._ours:
             self._ours = ours
             self._changed.set()

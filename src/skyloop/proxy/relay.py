@@ -46,11 +46,11 @@ SILENT_S: Final = 1.0
 MAX_AHEAD_S: Final = 1.0
 MAX_JOINED: Final = 8  #: maximum number of processors that one application may work for
 
-_Key = tuple[int, str]  # number of the application, name of the processor
+_Key = tuple[int, str]  # number of the application, and name of the processor
 
 
 class Relay:
-    """Relays annotations, log entries and poses, on the receiving thread. No authority is needed."""
+    """Relays annotations, log entries and poses on the receiving thread. No authority is needed."""
 
     def __init__(
         self,

@@ -38,10 +38,10 @@ from skyloop.proxy.core.command_checks import Intents
 from skyloop.proxy.events import Counters, Episodes
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_PENDING: Final = 16  #: maximum number of an application's waiting requests; further ones are refused
-#: More malformed packets than this within a second end the connection, whose ends evidently speak different protocols.
+MAX_PENDING: Final = 16  #: maximum number of an application's waiting requests; further requests are refused
+#: More malformed packets than this within a second end the connection: its ends evidently use different protocols.
 MAX_MALFORMED: Final = 50
-#: Time limit for a connection's Hello, which clients send at once.
+#: Time limit for a connection's Hello, which clients send immediately.
 HELLO_NS: Final = 5 * NS_PER_S
 
 MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat requests for a few seconds at most
@@ -79,7 +79,7 @@ class Session:
 
 
 class Answers:
-    """The pending requests of one connection, and the answers stored for repeats. Not thread-safe."""
+    """The pending requests of one connection, and the answers that are stored for repeats. Not thread-safe."""
 
     def __init__(self) -> None:
         self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request
@@ -87,7 +87,7 @@ class Answers:
         self._forgotten = 0  # highest number of a request whose stored answer has been dropped
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
-        """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
+        """Mark a request as pending, unless it is a repeat or ``most`` requests are already pending.
 
         Returns whether the request has been executed or is being executed, and whether the limit has been reached.
         """
@@ -110,7 +110,7 @@ class Answers:
 
 
 class JobQueue(Protocol):
-    """Runs jobs one after another, on a thread that may be shared with other proxies."""
+    """Runs jobs one after another on a thread that may be shared with other proxies."""
 
     def start(self) -> None:
         """Start running jobs."""
@@ -119,11 +119,11 @@ class JobQueue(Protocol):
         """Queue a job. The job must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """Stop after the current job; if that takes longer than this, leave it to its daemon thread."""
+        """Stop after the current job. If the job takes longer than this, leave it to its daemon thread."""
 
 
 class JobThread:
-    """A :class:`JobQueue` with its own thread."""
+    """A :class:`JobQueue` that has its own thread."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -185,7 +185,7 @@ class RequestDispatcher:
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Run a job, which must not raise, on the requests thread, after those already waiting."""
+        """Run a job on the requests thread, after the jobs that are already waiting. The job must not raise."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
@@ -234,7 +234,7 @@ class RequestDispatcher:
         self._finish(session, request, reply)
 
     def _finish(self, session: Session, request: Request, body: AnyReply) -> None:
-        """Send an answer, and store it for repeats if the request changed something."""
+        """Send an answer. Store it for repeats if the request changed something."""
         packet = self._reply(session, request, body)
         with self._pending_lock:
             session.answers.end(request.id, packet if isinstance(request.body, _CHANGING) else None)
@@ -259,4 +259,4 @@ def _refusal(code: str) -> Refusal:
     try:
         return Refusal(code)
     except ValueError:
-        return Refusal.DRIVER_FAILED  # a driver's own refusal, with an unknown code
+        return Refusal.DRIVER_FAILED  # a driver refused for a reason of its own, with an unknown code

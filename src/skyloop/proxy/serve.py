@@ -26,7 +26,7 @@ from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: maximum time that a proxy waits for its vehicle to land after a signal
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: time that a private proxy waits for the landing after its program has gone
 _POLL_S: Final = 0.2
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; a waiting message is printed only later
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
@@ -51,7 +51,7 @@ class LinkLines:
         self._was_there = False
 
     def first(self, state: LinkState) -> str:
-        """Return the first line, once applications can connect: ``ready`` only if the vehicle answers, too."""
+        """Return the first line once applications can connect. It is ``ready`` only if the vehicle answers, too."""
         self._was_there = state in _THERE
         if self._was_there:
             self._written = state, "", ""
@@ -80,7 +80,7 @@ class Shutdown:
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
-        """Request that the process end. Thread-safe, also for signal handlers."""
+        """Request that the process end. Thread-safe, even for signal handlers."""
         if hurry or self.requested.is_set():  # a second signal ends the process immediately
             self.hurry.set()
         self.reason = self.reason or reason
@@ -199,7 +199,7 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
     """End several proxies at the same time with :meth:`Proxy.end`. Then raise the first of their errors.
 
-    Ctrl-C, unless it is handled elsewhere, ends the wait for landings, and is raised when all have ended.
+    Ctrl-C ends the wait for landings unless it is handled elsewhere. It is raised when all have ended.
     """
     raised: list[Exception] = []
     with interrupt_deferred() as interrupted:

@@ -1,8 +1,8 @@
 """Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
-A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
-alone. Its rate and size adapt to the path, based on acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
+A format with a fixed rate is shared by all who request it. A format named after a subscriber is for that subscriber
+alone. Its rate and size adapt to the path (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle itself sends H.264,
+such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One camera's H.264 in one format; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
+    """One camera's H.264 in one format. Its thread calls ``publish``, or ``fail`` with a readable reason."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class StreamForm:
         self.topic = topic
         self.request = request
         self.asked_ns = 0
-        self.skipped = 0  #: number of frames not encoded, because the path or the encoder was busy
+        self.skipped = 0  #: number of frames that were not encoded because the path or the encoder was busy
         self._fps = camera.fps if camera.fps > 0.0 else _FPS
         if request.max_fps is not None:
             self._fps = min(self._fps, request.max_fps)
@@ -108,7 +108,7 @@ class StreamForm:
 
     @property
     def max_fps(self) -> float:
-        """Maximum rate at which the stream uses frames; infinity if it uses all."""
+        """Maximum rate at which the stream uses frames; infinity if it uses all of them."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
@@ -137,7 +137,7 @@ class StreamForm:
             return self._limiter.in_time(header.captured_ns)
 
     def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for encoding, replacing a waiting one; its bytes must not change afterwards."""
+        """Queue a frame for encoding. It replaces a frame that is waiting, and its bytes must not change afterwards."""
         with self._changed:
             if self._ended:
                 return
@@ -242,7 +242,7 @@ class StreamForm:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
             if self._passing:
-                return  # the vehicle's own stream has replaced it
+                return  # the vehicle's own stream has replaced this one
             self._seq += 1
             seq = self._seq
             if is_key:
@@ -334,7 +334,7 @@ class Streams(Forms[StreamForm]):
             form.put(header, copy)
 
     def own(self, picture: EncodedFrame) -> None:
-        """Publish a frame encoded by the vehicle, unchanged and in the streams that forward it."""
+        """Publish a frame that the vehicle encoded, both unchanged and in the streams that forward it."""
         self.publish(picture)
         for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:

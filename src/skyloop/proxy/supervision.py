@@ -1,11 +1,11 @@
-"""React to time, links and the authority during a flight; every decision about it is made under one lock.
+"""React to time, links and the authority during a flight. Every decision about the flight is made under one lock.
 
 The lock is also held while the driver is called. The transport's threads deliver commands and requests for the
-authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions themselves are pure, in
+authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions are pure functions in
 :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing that is called under the last two locks
-calls back into this module. A driver publishes what it receives on any thread without this lock.
+Lock order: this lock first, then the publisher's lock, then the lock of the events. Nothing that is called under the
+last two locks calls back into this module. A driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class FlightSupervisor:
             why_not=executor.why_not,
             native=executor.native,
         )
-        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock; True: the flight is ours
+        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock; True if it is the proxy's
         self._returns = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
@@ -110,16 +110,16 @@ class FlightSupervisor:
         self._sessions = sessions
         self._clock = clock
         self._left = False  # the proxy is ending, and makes no more decisions about the flight
-        self._pilot = "none"  # "held", or why the authority has no holder
+        self._pilot = "none"  # "held", or the reason why the authority has no holder
         self._breaks_seen = 0  # number of times that the vehicle link had broken at the last check
-        self._heard_ns = -LATEST_NS  # time of the last tick that found the vehicle link up
+        self._heard_ns = -LATEST_NS  # time of the last tick at which the vehicle link was up
         self._slept = slept
         self._slept_seen = slept()  # time the computer had slept in total at the last check
-        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and when it ended
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and the time when it ended
         #: Deadline for a take-off that was sent but has had no visible effect yet; None if there is none.
         self._rising_until_ns: int | None = None
         self._drifts = False  # whether the software autopilot drifts, as last reported
-        self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
+        self._enforced = True  # whether safety box and zones could be enforced at the last set-point
         self._episodes = Episodes()  # episodes in which limits reduced actions of the proxy itself, without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
@@ -287,7 +287,7 @@ class FlightSupervisor:
         self._withdraw_takeoff(now_ns)
 
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
-        """End or complete the holder's intent according to the vehicle's actions; return the flight state."""
+        """End or complete the holder's intent, based on the vehicle's actions; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
@@ -304,14 +304,14 @@ class FlightSupervisor:
         return self._executor.state
 
     def _observe_takeoff(self, now_ns: int) -> None:
-        """Withdraw a take-off past its deadline, even if a set-point has replaced it."""
+        """Withdraw a take-off that is past its deadline, even if a set-point has replaced it."""
         if self._rising_until_ns is not None and not self._executor.stands:
             self._rising_until_ns = None  # the vehicle has left the ground
         elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
-        """Cancel a take-off that has had no visible effect yet; return whether there was one.
+        """Cancel a take-off that has had no visible effect yet. Return whether there was such a take-off.
 
         A landing command sent to a vehicle on the ground cancels an arming that is still in progress.
         """
@@ -337,7 +337,7 @@ class FlightSupervisor:
     def _report_limits(
         self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
     ) -> None:
-        """Publish limits that begin to affect this application's commands, or the proxy's own actions."""
+        """Publish the limits that begin to affect this application's commands, or the proxy's own actions."""
         if enforced is not None and enforced is not self._enforced:
             self._enforced = enforced
             self._events.publish_drafts(enforcement_event(enforced))
@@ -346,7 +346,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that the limits, safety box and zones allow for the software autopilot's step."""
+        """Return the velocity nearest to the software autopilot's that limits, safety box and zones allow."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
@@ -357,7 +357,7 @@ class FlightSupervisor:
     # Authority ----------------------------------------------------------------------------------------------------
 
     def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Hover while the authority changes hands, then publish the events in ``news`` and the changes."""
+        """Hover while the authority changes hands. Then publish the events in ``news`` and the changes."""
         for effect in effects:
             if not isinstance(effect, Lost | Preempted | Granted):
                 continue
@@ -407,7 +407,7 @@ class FlightSupervisor:
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Let the ladder decide and act; return the events to publish. ``stamps``: whether the holder has changed."""
+        """Let the ladder decide and act. Return the events to publish. ``stamps``: whether the holder has changed."""
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight

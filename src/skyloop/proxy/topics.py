@@ -1,6 +1,6 @@
 """A proxy's topics: their names, feedback at reduced rates, and the overview.
 
-No other topics can be subscribed to, so that made-up names cost nothing.
+No other topics can be subscribed to, so that made-up names use no resources.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
 
 
 class Form(Protocol):
-    """A variant of samples, published on one topic."""
+    """A variant of samples that is published on one topic."""
 
     topic: str
     asked_ns: int  #: time of the newest request for this variant
@@ -85,7 +85,7 @@ F = TypeVar("F", bound=Form)
 
 
 class Forms(Generic[F]):
-    """A limited number of variants that have, or may soon have, subscribers. Thread-safe."""
+    """A limited number of variants that have subscribers or may soon have some. Thread-safe."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
         self.known: tuple[F, ...] = ()
@@ -99,7 +99,7 @@ class Forms(Generic[F]):
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
-        """Reserve a place for a variant, or renew it; return False if all places are taken."""
+        """Reserve a place for a variant, or renew the reservation. Return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
             form = self.find(topic)
@@ -124,7 +124,7 @@ class _Variant:
 
 
 class FeedbackVariants(Forms[_Variant]):
-    """The variants of feedback that have, or may soon have, subscribers."""
+    """The variants of feedback that have subscribers or may soon have some."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock) -> None:
         super().__init__(MAX_VARIANTS, server.subscribers, clock)
@@ -157,7 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # due to native telemetry, and reported already
+            except (ValueError, TypeError, OverflowError):  # caused by native telemetry, and already reported
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -203,10 +203,10 @@ class OverviewRegistry:
 
 
 class OverviewPublisher:
-    """Publishes the overview on one proxy's transport once a second, and at once to a new subscriber."""
+    """Publishes the overview on one proxy's transport once a second, and immediately to a new subscriber."""
 
     def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
-        self.registry = OverviewRegistry()  #: provides the published rows; by default only the proxy's own
+        self.registry = OverviewRegistry()  #: provides the published rows; by default, only the proxy's own row
         self._server = server
         self._row = row
         self._subscribers = 0

@@ -58,7 +58,7 @@ def results(processor: str) -> str:
 
 _UINT8 = np.dtype(np.uint8)
 
-#: Bytes of a frame: shape (size,), uint8, not writeable. The pixels stay unchanged while any view of them exists.
+#: A frame's bytes: shape ``(size,)``, uint8, not writeable. The pixels stay unchanged while any view of them exists.
 Pixels = NDArray[np.uint8]
 
 
@@ -83,7 +83,7 @@ class ServerHandler(Protocol):
         """Handle a packet from an application. It has 1 to :data:`MAX_PACKET` bytes, and its content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
+        """Handle a packet that was dropped because its sender's keys forbid it. :data:`NOBODY`: an unknown sender."""
 
     def topic_problem(self, topic: str) -> str:
         """Return why a topic can't be subscribed to, and which topics exist; empty if it can.
@@ -92,7 +92,7 @@ class ServerHandler(Protocol):
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Handle a request for an unknown topic, or for more topics than allowed; ``reason`` is readable text."""
+        """Handle a request for an unknown topic, or for more topics than are allowed. ``reason`` is readable text."""
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         """Handle the end of a connection. Called once for each ``peer_joined``, after the last packet."""
@@ -114,7 +114,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send a packet to one application; return False if it has gone or its buffer is full."""
+        """Send a packet to one application. Return False if the application has left or its buffer is full."""
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
@@ -122,7 +122,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
+        """Send a frame to every subscriber of its camera; return the number of subscribers that did *not* receive it.
 
         ``pixels``: ``header.size`` bytes of dtype uint8, in any shape, C-contiguous. Otherwise :class:`UsageError` is
         raised. They may be reused after the call.
@@ -150,7 +150,7 @@ class TransportServer(ABC):
 
     @property
     def restricted(self) -> bool:
-        """Whether access to this proxy need not imply access to others, as with keys that name drones."""
+        """Whether an application may have access to this proxy but not to others, as with keys that name drones."""
         return False
 
     @property
@@ -168,7 +168,7 @@ class ClientHandler(Protocol):
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         """Handle a frame: ``header.size`` bytes, shape (size,), dtype uint8, not writeable.
 
-        The handler may keep the pixels, or any view of them, for as long as it likes; that affects only this
+        The handler may keep the pixels, or any view of them, for as long as it likes; this affects only its own
         application. ``topic``: the subscribed topic that the frame belongs to, if :attr:`TransportClient.variants` is
         true.
         """
@@ -215,7 +215,7 @@ class TransportClient(ABC):
     def same_clock(self) -> bool:
         """Whether both ends are on one host and read the same monotonic clock. If so, the offset is zero.
 
-        An application also checks the clock that the proxy's ``Welcome`` names: a host can have several time namespaces.
+        An application also checks the clock that ``Welcome`` names, because a host can have several time namespaces.
         """
 
     @property
@@ -237,7 +237,7 @@ class TransportClient(ABC):
         """Readable address that this end is connected to."""
 
 
-#: Connects and starts delivering to the handler. Raises :class:`skyloop.errors.LinkError` if that fails.
+#: Connects and starts delivering packets to the handler. Raises :class:`skyloop.errors.LinkError` if that fails.
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
@@ -272,7 +272,7 @@ def too_many_topics(topic: str) -> str:
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Raise :class:`UsageError` unless pixels match their header in size, dtype and order."""
+    """Raise :class:`UsageError` unless the pixels match their header in size, dtype and order."""
     if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(

@@ -14,15 +14,14 @@ from skyloop.transport.priority import PriorityLock, is_command
 class CompositeServer(TransportServer):
     """One transport server that combines several, nearest first. It assigns its own numbers to their peers.
 
-    The handler gets one call at a time, as the contract requires: an end that has a command goes first, the others in
-    order of arrival.
+    The handler gets one call at a time, as the contract requires. Ends with a command go first, then by arrival.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
         if not ends:
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
-        self.lock = PriorityLock()  #: a thread must hold it to call the handler
+        self.lock = PriorityLock()  #: a thread must hold this lock to call the handler
         self._members: dict[
             int, tuple[TransportServer, Peer]
         ] = {}  # for each of our numbers, the end that the application is connected to, and its peer at that end
@@ -43,7 +42,7 @@ class CompositeServer(TransportServer):
     def stop(self) -> None:
         """Stop all ends at the same time, and wait for them unless this is called from a handler.
 
-        Waiting inside a handler would deadlock: its caller holds the lock that the stopping end waits for.
+        Waiting inside a handler would deadlock, because its caller holds the lock that the stopping end waits for.
         """
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:

@@ -47,7 +47,7 @@ class TransportSuite(ABC):
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
-        """Return a dialer to a server from :meth:`make_server`, whether started or not.
+        """Return a dialer to a server from :meth:`make_server`. The server may not be started.
 
         It raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the server does
         not run.
@@ -208,7 +208,7 @@ class TransportSuite(ABC):
                 server.publish_frame(header(seq), picture(header(seq)))
                 wait_until(partial(app.log.saw, seq), "the frame arrived, whatever views are kept")
                 head, pixels = app.log.frames.pop()
-                if seq % 4 == 0:  # the frame is kept alive only by a view of a view
+                if seq % 4 == 0:  # only a view of a view keeps the frame alive
                     views[head.seq] = pixels.reshape(head.height, head.width, 3)[::2, 1::2]
                 del pixels
             app.client.close()
@@ -260,7 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial; convert the error for an unknown name (``UsageError``), which is equally valid, to ``LinkError``."""
+        """Dial, and convert the other valid error for an unknown name (``UsageError``) to ``LinkError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

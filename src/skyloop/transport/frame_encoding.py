@@ -57,7 +57,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
 
 
 def resized(picture: Any, header: FrameHeader) -> Any:
-    """Resize an image of shape (height, width, channels) to the header's size by averaging areas, with OpenCV."""
+    """Resize an image of shape (height, width, channels) to the header's size. OpenCV averages areas."""
     size = (header.width, header.height)
     return _opencv().resize(picture, size, interpolation=_opencv().INTER_AREA).reshape(header.height, header.width, -1)
 

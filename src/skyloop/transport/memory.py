@@ -37,13 +37,13 @@ from skyloop.transport.base import (
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
 DEPTH = 256  #: maximum number of packets waiting at one end; further packets are dropped
-FRAME_DEPTH = 4  #: maximum number of a camera's frames waiting at a client; the newest replaces the one before it
+FRAME_DEPTH = 4  #: maximum number of a camera's frames that wait at a client; the newest replaces the previous one
 
 _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-#: A client, and a call to the handler that the server's receiving thread makes on its behalf.
+#: A client, and a call to the handler that the server's receiving thread makes on the client's behalf.
 _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
@@ -61,7 +61,7 @@ class MemoryServer(TransportServer):
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect to this server, which must be running. The handler runs on the client's own receiving thread."""
+        """Connect to this server. It must be running. The handler runs on the client's own receiving thread."""
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"{self.address} has no server: start the transport server first")
@@ -134,7 +134,7 @@ class MemoryServer(TransportServer):
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection; ``muted``: drop the client's undelivered packets. Idempotent."""
+        """End a connection. ``muted``: drop the client's undelivered packets. Idempotent."""
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
                 return
@@ -173,7 +173,7 @@ class MemoryClient(TransportClient):
         # Items: a packet, the name of a camera that has a frame to deliver, or None once the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # whether either end has ended the connection, so that nothing can be sent
+        self._ended = False  # whether either end has ended the connection, so that nothing more can be sent
         self._closing = False  # whether this end has closed the connection and therefore delivers nothing more
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
@@ -234,7 +234,7 @@ class MemoryClient(TransportClient):
         return True
 
     def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
-        """Queue a frame from the server; return False if it replaced a waiting frame, or the connection has ended."""
+        """Queue a frame from the server. Return False if it replaced another, or if the connection has ended."""
         room = True
         with self._down_lock:
             if self._ended:

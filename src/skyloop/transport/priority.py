@@ -1,12 +1,12 @@
 """Commands first: the order in which packets, and the threads that carry them, reach the proxy.
 
-A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, handling
-outdated set-points costs time, only for them to be refused as stale, and the proxy gets even later. Therefore in a
-:class:`PacketBacklog`, a newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency
-stop) are kept; only repeats of the same one are merged.
+A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, it spends time
+on outdated set-points, only to refuse them as stale, and gets even later. Therefore in a :class:`PacketBacklog`, a
+newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency stop) are kept; only
+repeats of the same request are merged.
 
 Several threads share a :class:`PriorityLock` in order of arrival, commands first. A ``threading.RLock`` goes to any
-thread that is awake: one that re-acquires it in a loop can starve all others, and a command would wait behind two
+thread that is awake. A thread that re-acquires it in a loop can starve all others, and a command would wait behind two
 hundred requests from another application.
 """
 
@@ -118,7 +118,7 @@ class PacketBacklog:
 
 
 def _command(packet: bytes) -> Command | None:
-    """Return the command in a packet; None for anything else, including damaged commands."""
+    """Return the command in a packet; None if it contains anything else, including a damaged command."""
     if not is_command(packet):
         return None
     try:
@@ -136,14 +136,14 @@ class PriorityLock:
 
     def __init__(self) -> None:
         self._taken = threading.Lock()  # locked while a thread owns this lock, and during a hand-over
-        self._owner = 0  # identity of the owning thread
-        self._depth = 0  # additional acquisitions by the owner
+        self._owner = 0  # identity of the thread that owns the lock
+        self._depth = 0  # additional acquisitions of the lock by its owner
         self._queues = threading.Lock()  # guards the queues
-        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiters, each with a lock to wake it
+        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiting threads, each with a lock that wakes it
         self._others: deque[tuple[threading.Lock, int]] = deque()
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock, ahead of all non-urgent waiters if ``urgent``; the owner may acquire it again."""
+        """Wait for the lock, ahead of all non-urgent threads if ``urgent``. The owner may acquire the lock again."""
         me = threading.get_ident()
         if self._taken.acquire(False):  # the most frequent case, handled in as few steps as possible
             self._owner = me
@@ -183,7 +183,7 @@ class PriorityLock:
 
     @property
     def waiting(self) -> int:
-        """Number of waiting threads."""
+        """Number of threads that wait."""
         return len(self._urgent) + len(self._others)
 
     __enter__ = acquire

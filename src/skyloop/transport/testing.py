@@ -41,8 +41,7 @@ def raises(error: type[Exception], call: Callable[[], object]) -> None:
 class ServerLog:
     """A server's handler that records its calls.
 
-    Its lists grow on the transport's receiving thread, where ``on_packet``, if set, is called with each packet after it
-    was recorded.
+    Its lists grow on the transport's receiving thread. If ``on_packet`` is set, it is called there with each packet.
     """
 
     def __init__(self) -> None:
@@ -125,7 +124,7 @@ def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> 
 
 
 def picture(head: FrameHeader) -> Pixels:
-    """Return the pixels of a frame for tests, as bytes; each byte depends on the frame's number."""
+    """Return the pixels of a frame for tests, as bytes. Each byte depends on the frame's number."""
     return (np.arange(head.size, dtype=np.uint32) * 7 + head.seq * 31).astype(np.uint8)
 
 

@@ -38,7 +38,7 @@ class KeyRing:
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
-        #: Names that were revoked, or whose rights changed, since this process applied its roster.
+        #: Names that were revoked, or whose rights have changed, since this process applied its roster.
         self.shut_out: frozenset[str] = frozenset()
         self._in_force = credentials.roster
         self._listed = frozenset(credentials.roster.identities)  # identities that are in the newest roster
@@ -119,7 +119,7 @@ class Proof(msgspec.Struct, frozen=True, array_like=True):
 
     certificate: bytes  #: DER
     share: bytes  #: X25519, 32 bytes
-    signature: bytes  #: ECDSA with SHA-256, made with the certificate's key, DER
+    signature: bytes  #: ECDSA with SHA-256, made with the certificate's key, in DER
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ class Agreed:
 
     identity: Identity  #: the other end's identity
     expires: datetime  #: expiry of the other end's certificate
-    up: bytes  #: secret for the application's packets
+    up: bytes  #: secret that seals the application's packets
     down: bytes  #: secret that seals the proxy's packets
 
 
@@ -144,7 +144,7 @@ class Agreement:
         self._share = self._private.public_key().public_bytes_raw()
 
     def offer(self) -> bytes:
-        """Return the application's first message, a :class:`Proof` as MessagePack."""
+        """Return the application's first message, which is a :class:`Proof` as MessagePack."""
         self._offered = self._prove(self._claim(_OFFER, self._share))
         return self._offered
 

@@ -30,7 +30,7 @@ except ImportError as error:  # always installed where the tests run
 PrivateKey = ec.EllipticCurvePrivateKey
 Certificate = x509.Certificate
 
-#: Certificates are valid from a day before they are issued, for machines whose clocks are slow.
+#: Certificates are valid from the day before they are issued, for machines whose clocks are slow.
 BACKDATED: Final = timedelta(days=1)
 #: What a page authority may certify: private networks (RFC 1918, 4193, 3927, 6598), this machine …
 PAGE_NETWORKS: Final = (
@@ -95,7 +95,7 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Create a certificate for an identity, signed with the authority's key and valid no longer than the authority."""
+    """Create a certificate for an identity, signed with the authority's key and valid no longer than that."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
@@ -104,7 +104,7 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Create an authority for pages, separate from the lab's, that may certify only these names and names below them.
+    """Create an authority for pages, separate from the lab's. It may certify only these names and names below them.
 
     Its certificates are valid for private addresses, names on local networks, and the names given on creation. A
     browser that trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
@@ -148,7 +148,7 @@ def read_certificate(content: bytes, path: Path) -> x509.Certificate:
 
 
 def read_der(content: bytes) -> x509.Certificate:
-    """Decode a certificate in DER received over the network."""
+    """Decode a certificate in DER that was received over the network."""
     try:
         return x509.load_der_x509_certificate(content)
     except ValueError as error:
@@ -251,7 +251,7 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
 
 def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # verified by read_authority
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
     return public
 
 

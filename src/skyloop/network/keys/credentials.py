@@ -42,7 +42,7 @@ KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
 MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities takes 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
-NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
+NOTICE: Final = timedelta(days=7)  #: time before an expiry from which it is announced
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -163,7 +163,7 @@ class Credentials:
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return, for this key and the lab's authority, a warning if it has expired or will within a week."""
+        """Return warnings for this key and the lab's authority if they have expired or will within a week."""
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
@@ -285,7 +285,7 @@ def read(path: Path, what: str) -> bytes:
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """Read a file that must not be accessible to others, because they might have copied the key."""
+    """Read a file that must not be accessible to others, because they might have copied the key in it."""
     content = read(path, what)
     mode = path.stat().st_mode
     if mode & _OTHERS:

@@ -7,7 +7,7 @@ and subscribe to everything, and applies the rules to its own neighbours. Traffi
 forge anything (:mod:`skyloop.network.sealing`).
 
 The two directions mirror each other: proxies subscribe to what applications publish, and vice versa. Declarations and
-queries count as messages in the direction in which they travel, so a subscriber's declaration counts as published.
+queries count as messages in the direction that they travel, so a subscriber's declaration counts as published.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class KeyRole(StrEnum):
     """What a key permits its owner to do with the drones of its identity."""
 
     PILOT = "pilot"  #: may observe every drone, and fly its own
-    OBSERVER = "observer"  #: may see its drones, but not fly any
+    OBSERVER = "observer"  #: may observe its drones, but not fly any
     PROXY = "proxy"  #: may serve drones with its names
     ROUTER = "router"  #: forwards everyone's sealed traffic between networks; it could drop traffic, but not read it
 
@@ -134,7 +134,7 @@ def parse_drones(text: str) -> tuple[str, ...]:
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for any node in a lab: only these identities may join."""
+    """Return Zenoh's ``access_control`` section for any node in a lab. Only these identities may join."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -205,7 +205,7 @@ def may_subscribe(identity: Identity) -> Rules:
 
 
 def _to_applications(names: list[str]) -> list[str]:
-    """Return the keys on which proxies send packets and frames, and which applications subscribe to."""
+    """Return the keys that proxies send packets and frames on, and that applications subscribe to."""
     return [key for name in names for key in layout.downward(name)]
 
 
@@ -219,7 +219,7 @@ def _to_proxies(identity: Identity, who: str) -> list[str]:
 
 
 def _seen(identity: Identity) -> list[str]:
-    """Return the drones that an application may see. A pilot may see all drones, not only those it may fly."""
+    """Return the drones that an application may see. A pilot may observe all drones, not only those it may fly."""
     return _chunks(ALL_DRONES if identity.role is KeyRole.PILOT else identity.drones)
 
 

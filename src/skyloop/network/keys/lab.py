@@ -52,14 +52,14 @@ from skyloop.network.keys.credentials import (
 from skyloop.network.keys.identity import Identity
 
 AUTHORITY_DAYS: Final = 1825  #: default validity of a lab's authority
-IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
+IDENTITY_DAYS: Final = 30.0  #: default validity period of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
 FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
 
 PAGE_DAYS: Final = 366  #: browsers reject certificates that are valid for much longer
-RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left
+RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that is valid for fewer days than this
 
 
 class Lab:
@@ -102,7 +102,7 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster in the folder; :class:`UsageError` if it can't be read or was modified."""
+        """The roster in the folder. Raises :class:`UsageError` if it can't be read or was modified."""
         path = self.directory / ROSTER_FILE
         return decode_roster(read(path, "the roster"), self.authority, path)
 

@@ -23,20 +23,20 @@ from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
 LOST_NS: Final = 2 * NS_PER_S  #: if a position is older than this, the next one is not worth waiting for
-BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
+BLIND_M: Final = 0.5  #: maximum distance between walls that is flown towards a target without a new measured position
 #: A position counts as having jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
 MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further out, the vehicle may only move back
 BRAKE_GAIN: Final = 2.0  #: requested deceleration for each unit of excess speed [1/s]
 RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further past a wall
-#: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
+#: A vehicle that hovers this far above ``limits.altitude`` [m] is lowered, at this speed [m/s] or faster.
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
-TAKEOFF_M: Final = 1.0  #: assumed minimum height of a take-off
-LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be the table that the vehicle is on
+TAKEOFF_M: Final = 1.0  #: minimum height assumed for a take-off
+LIFTED_M: Final = 0.3  #: a zone lower than this does not prevent a take-off: it may be the table that the vehicle is on
 
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
-_BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
+_BLIND_S: Final = 0.1  # age of a position that the reaction time already allows for
 _OLD_S: Final = 1.0  # maximum age of a position that is taken into account, because the vehicle may be at rest
 _AT_REST_M_S: Final = 0.05  # below this speed, vehicles may report the same position repeatedly
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
@@ -44,7 +44,7 @@ _NO_WAY_M: Final = 0.05  # this close to the target, there is no meaningful dire
 _PASSES: Final = 8  # maximum number of passes in which all walls in turn reduce a velocity before a stop is required
 
 #: Permitted climb rate for each metre below ``limits.altitude`` [1/s]. It slows the vehicle down as it approaches that
-#: altitude. Above the limit, it sinks at the same rate per metre.
+#: altitude. Above the limit, the vehicle sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
 #: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
 SLACK_M: Final = 0.15
@@ -64,14 +64,14 @@ class Clamp:
 class Limits:
     """The limits in force."""
 
-    tilt: float = 0.35  #: maximum tilt from the vertical, by roll and pitch combined [rad]
+    tilt: float = 0.35  #: maximum tilt from the vertical, with roll and pitch combined [rad]
     climb: float = 1.0  #: maximum speed up or down [m/s]
     yaw_rate: float = 1.75  #: maximum yaw rate [rad/s]
     speed: float = 2.0  #: maximum horizontal speed [m/s]
     altitude: float = 5.0  #: maximum height above ground [m]
 
     def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Return the nearest set-point within the limits, and the limits that applied.
+        """Return the nearest set-point within the limits, and the limits that were applied.
 
         Tilt and horizontal speed are reduced without a change of direction. ``altitude`` is given [m] if it is known.
         """
@@ -119,10 +119,10 @@ class Verdict(NamedTuple):
     """The decision on a request."""
 
     action: AnyAction | None = None  #: the permitted action; None if the vehicle must stop, or stay on the ground
-    clamps: tuple[Clamp, ...] = ()  #: the limits that applied
+    clamps: tuple[Clamp, ...] = ()  #: the limits that were applied
     refusal: Refusal | None = None  #: also None (like ``action``) while the request only waits for a fresh position
     why: str = ""  #: readable reason for the refusal
-    enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
+    enforced: bool | None = None  #: whether safety box and zones could be enforced; None if there are none
 
 
 class Airspace:
@@ -130,7 +130,7 @@ class Airspace:
 
     def __init__(self, settings: AirspaceSettings | None = None) -> None:
         self.settings = settings or AirspaceSettings()
-        self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
+        self.jumped_m = 0.0  #: size of a recent jump of the position; whoever handles it resets this
         self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space when it was permitted
         self._sinks = self._blocked = False  # whether the vehicle is sinking to the ceiling, and whether it is blocked
         self._newest: Feedback | None = None
@@ -196,7 +196,7 @@ class Airspace:
         return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
 
     def apart(self) -> Airspace:
-        """Return a copy with the same observations, for hypothetical requests."""
+        """Return a copy with the same observations, for checking hypothetical requests."""
         other = Airspace(self.settings)
         other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
         other._sides, other._ground = dict(self._sides), self._ground.copy()
@@ -241,7 +241,7 @@ class Airspace:
     def allowed_speed(self, distance: float, late_s: float) -> float:
         """Return the maximum speed towards a wall at this distance [m/s]; 0 beyond the wall."""
         deceleration = self.settings.deceleration
-        # The positive root of v·t + v²/(2·a) = d.
+        # The positive root of ``v·t + v²/(2·a) = d``.
         lost = deceleration * late_s
         return math.sqrt(lost * lost + 2 * deceleration * distance) - lost if distance > 0.0 else 0.0
 
@@ -375,7 +375,7 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        # This is reported only once, because the direction changes near the target.
+        # It is reported only once, because the direction changes near the target.
         if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
@@ -442,7 +442,7 @@ class Airspace:
 
 
 def _speed(feedback: Feedback) -> float:
-    """Return the reported speed [m/s]; 0 if there is none."""
+    """Return the reported speed [m/s]; 0 if none was reported."""
     return 0.0 if feedback.velocity_m_s is None else math.hypot(*feedback.velocity_m_s)
 
 

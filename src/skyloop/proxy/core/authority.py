@@ -1,7 +1,7 @@
 """The authority to command: numbered leases, priorities, and a queue of pilots who wait. Pure: the time is an argument.
 
 Priority 0 is the highest, 31 the lowest. At any time, at most one application *holds* the authority. The holder has a
-lease, whose number is unique in this run. A strictly higher priority takes over at once, or after the holder has been
+lease, whose number is unique in this run. A strictly higher priority takes over at once or after the holder has been
 asked. A pre-empted pilot waits in the queue, which is ordered by priority and then by arrival. A holder that requested
 the authority for a limited time loses it once that time is over and others are waiting. See ``docs/proxy.md``.
 """
@@ -51,7 +51,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Preempted:
-    """The lease ended because of a request with strictly higher priority, or because the holder ``granted`` one.
+    """The lease ended because of a request with strictly higher priority, or because the holder ``granted`` a request.
 
     The former holder waits in the queue.
     """
@@ -75,7 +75,7 @@ class Queued:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The holder is being asked to hand the authority over."""
+    """The holder is being asked to hand over the authority."""
 
     app_id: int  #: the holder
     lease: int
@@ -123,7 +123,7 @@ class Authority:
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 if there is none
         self.last_command_ns = 0  #: time of the last valid command from the current or an earlier holder
-        self._granted_ns = 0  # when the holder got the lease
+        self._granted_ns = 0  # time at which the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
         #: The last holder, if it lost the lease by falling silent. It is listed until someone requests the authority.
         self.silent: QueueEntry | None = None
@@ -140,7 +140,7 @@ class Authority:
 
     @property
     def waiting(self) -> tuple[QueueEntry, ...]:
-        """The queue, the next one first."""
+        """The queue, with the next application first."""
         return tuple(self._waiting)
 
     @property
@@ -149,7 +149,7 @@ class Authority:
         return self._last_lease
 
     def position(self, app_id: int) -> int:
-        """Return the position in the queue, starting with 1; 0 if the application is not waiting."""
+        """Return the position in the queue, counted from 1; 0 if the application is not waiting."""
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
 
     def asking(self, app_id: int, now_ns: int) -> bool:
@@ -178,9 +178,9 @@ class Authority:
     ) -> list[Effect]:
         """Request the authority, or change an earlier request's priority or time.
 
-        ``queue``: whether to wait in the queue. ``term_ns``: requested duration; None: until released. ``ask``: whether
-        to ask the holder first. Afterwards the application holds the authority, has a :meth:`position`, or has been
-        refused because a holder has at least the same priority.
+        ``queue``: whether to wait in the queue. ``term_ns``: requested duration; None means until it is released.
+        ``ask``: whether to ask the holder first. Afterwards the application holds the authority, has a :meth:`position`
+        in the queue, or was refused because a holder has at least the same priority.
         """
         effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
@@ -232,7 +232,7 @@ class Authority:
         return self._drop(app_id, "gone", now_ns)
 
     def update(self, now_ns: int) -> list[Effect]:
-        """Apply changes due by time; call at a steady pace.
+        """Apply changes that are due at this time. Call at a steady pace.
 
         The lease of a silent holder ends. The lease of a holder whose time is over ends while others wait. A holder
         that has been asked for long enough is pre-empted.
@@ -334,7 +334,7 @@ class Authority:
         return self._hand_over(now_ns) + self._moved(now_ns)
 
     def _hand_over(self, now_ns: int) -> list[Effect]:
-        """Give the authority to the first in the queue if due.
+        """Give the authority to the first application in the queue if this is due.
 
         This is the case if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """

@@ -1,6 +1,6 @@
-"""The software autopilot: take-off, hover, land, velocity and position for vehicles that lack them. Pure.
+"""The software autopilot: take-off, hover, land, velocity and position for vehicles that lack these actions. Pure.
 
-It also handles the return to where the vehicle took off, for all vehicles. This is a series of targets, each judged as
+It also handles the return to the take-off position, for all vehicles. A return is a series of targets, each judged as
 for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start,
 and a landing or hover there. The caller steps both. ``docs/proxy.md`` describes the rules of the return.
 
@@ -42,12 +42,12 @@ ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
 GO_GAIN: Final = 0.9  #: speed for each metre that remains to the target [1/s]
-GO_SPEED: Final = 1.0  #: maximum speed on the way to a target if none is given [m/s]
+GO_SPEED: Final = 1.0  #: maximum speed on the way to a target, if the target gives none [m/s]
 GO_DECELERATION: Final = 0.6  #: deceleration towards the target [m/s²]
 TURN_GAIN: Final = 1.5  #: yaw rate per radian that remains to turn [1/s]
-TURN_RATE: Final = 1.2  #: maximum yaw rate if none is given [rad/s]
+TURN_RATE: Final = 1.2  #: maximum yaw rate if the set-point gives none [rad/s]
 SETTLED_SPEED: Final = 0.2  #: speed below which a hover holds its position [m/s]
-ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
+ARRIVED: Final = 0.1  #: a take-off ends at this distance below its altitude [m]
 LONGEST_RISE: Final = 2.0  #: a take-off ends after this multiple of its nominal duration, ...
 LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
@@ -55,9 +55,9 @@ LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 NEAR_M: Final = 0.3  #: a vehicle that is this close and at rest has arrived
 CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arrived
 AT_REST_M_S: Final = 0.3
-HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this ...
-STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
-#: How long a failsafe tolerates something that prevents a return before it lands the vehicle in place.
+HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this …
+STALL_NS: Final = 10 * NS_PER_S  #: … within this time
+#: How long a failsafe waits for a problem that prevents a return to go away, before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
 CLEARANCE_M: Final = 0.3  #: distance to keep from the ceiling of the room and the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -86,7 +86,7 @@ class AutopilotSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReturnSettings:
-    """Settings of a return."""
+    """The settings of a return."""
 
     height: float = 2.0  #: minimum height above the start on the way [m]
     speed: float = 1.0  #: maximum speed on the way back [m/s]
@@ -114,7 +114,7 @@ _STATES: Final = {
 
 
 class Autopilot:
-    """Flies one vehicle in software; ``flight`` is informed of the current task and decides when it has ended."""
+    """Flies one vehicle in software. ``flight`` is informed of the current task and decides when the task has ended."""
 
     def __init__(
         self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None
@@ -129,7 +129,7 @@ class Autopilot:
         self._target: Velocity | Position = Velocity()
         self._integral = (0.0, 0.0)  # integrals in the forward and left directions [rad]
         self._stepped_ns: int | None = None
-        self._lifted_ns: int | None = None  # when the take-off left the ground
+        self._lifted_ns: int | None = None  # time at which the take-off left the ground
         self._from_height: float | None = None  # height at that time, according to the position [m]
         self._altitudes: set[float] = set()  # lowest and highest readings since then [m]
         self._hold_altitude: float | None = None
@@ -139,7 +139,7 @@ class Autopilot:
     def start(
         self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
     ) -> None:
-        """Start a task; :meth:`step` continues it. Repeating the current task changes nothing."""
+        """Start a task. :meth:`step` continues it. Repeating the current task changes nothing."""
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
@@ -160,7 +160,7 @@ class Autopilot:
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
-        """Stop moving, because the vehicle failed to execute the action that was to replace this task."""
+        """Stop moving, because the vehicle failed to execute the action that was supposed to replace this task."""
         if isinstance(self._target, Position) and self._target.yaw is not None:
             self._hold_yaw = None  # hold the current yaw, as in ``start``
         self._target = Velocity()
@@ -224,8 +224,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter always reads the same. If its readings change but show the vehicle on the ground when time
-        # is up, they are right: the motors turn without lifting off, as seen with a real Betaflight on a slow computer.
+        # A stuck altimeter always reports the same altitude. If its readings change but stay near the ground until time
+        # is up, they are right: the motors turn without lifting it, as with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
@@ -257,7 +257,7 @@ class Autopilot:
         return Velocity(forward, left, up)
 
     def _go(self, target: Position, known: Feedback | None) -> Velocity:
-        """Fly straight to a target, more slowly near it; stop while the position or yaw is unknown."""
+        """Fly straight to a target, slower when close to it. Stop while the position or yaw is unknown."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
         if self._hold_yaw is None:
@@ -318,7 +318,7 @@ class StartPoint:
     """Stores the position where the vehicle last left the ground, in world axes."""
 
     def __init__(self) -> None:
-        self.position: Vec3 | None = None  #: the position [m]; None if unknown
+        self.position: Vec3 | None = None  #: the position [m]; None if it is unknown
         self._state = FlightState.UNKNOWN
         self._standing_ns: int | None = None  # start of the current period of time on the ground; None in the air
         self._flew = False  # whether the vehicle has been seen in the air
@@ -410,7 +410,7 @@ class ReturnFlight:
         return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, problem, True) if problem else None
 
     def _begin(self, start: Vec3, airspace: Airspace, feedback: Feedback, at: Vec3) -> str:
-        """Plan the whole return; return what is in the way, as readable text."""
+        """Plan the whole return. Return what is in the way, as readable text."""
         space = airspace.settings.space
         top = max(at[2], start[2] + self._height) if math.dist(at[:2], start[:2]) >= CLOSE_M else at[2]
         top = min(top, airspace.ceiling(feedback))
@@ -424,7 +424,7 @@ class ReturnFlight:
         if not problem and climbs:
             problem = space.problem_between(at, above)
         if not problem and self._land:
-            below = Space(zones=space.zones)  # the box may end above the ground
+            below = Space(zones=space.zones)  # the bottom of the box may be above the ground
             problem = below.problem_between(over, start)
         if problem:
             return problem
@@ -434,7 +434,7 @@ class ReturnFlight:
         return ""
 
     def _go_on(self, feedback: Feedback, at: Vec3, now_ns: int) -> str:
-        """Start the next leg when the current one is over; return an objection, if any, as readable text."""
+        """Start the next leg when the current leg is over. Return an objection, if there is one, as readable text."""
         left_m = math.dist(at, self._flown)
         paused, self._stepped_ns = now_ns - self._stepped_ns > NS_PER_S, now_ns
         if paused or left_m < self._left_m - HEADWAY_M:
@@ -443,7 +443,7 @@ class ReturnFlight:
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
                 self.phase, self._left_m = ReturnPhase.FLYING, math.inf
-                self._target = self._flown = self._over  # it is judged together with the straight line to it
+                self._target = self._flown = self._over  # it is judged together with the straight line to the start
                 return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S

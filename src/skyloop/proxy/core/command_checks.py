@@ -46,7 +46,7 @@ from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, ReturnSet
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
-MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
+MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: maximum lead of a command's time, given errors in the clock offset
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground after this time is withdrawn
 #: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
@@ -57,7 +57,7 @@ _PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: the nex
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
-_TAKING: Final = (Takeoff, Hover, Land)  #: actions that, as new requests, take over a vehicle flown by others
+_TAKING: Final = (Takeoff, Hover, Land)  #: actions that take over a vehicle flown by others if they are new requests
 
 
 @dataclass(slots=True)
@@ -67,7 +67,7 @@ class Intent:
     number: int
     action: AnyAction
     asked_ns: int
-    state: FlightState  #: the vehicle's state when it was requested, or last observed
+    state: FlightState  #: the vehicle's state when the intent was requested or last observed
     fate: Fate = Fate.UNDER_WAY
     begun: bool = False  #: whether the vehicle has started to execute the intent
     automatic: bool = False  #: whether the library itself requested the intent
@@ -91,8 +91,8 @@ class Intent:
     def refuse(self, reason: Refusal, why: str) -> None:
         """End the intent with a refusal.
 
-        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. Resets
-        always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. So do
+        all resets, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -146,7 +146,7 @@ NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
 class Intents:
-    """The requests of one connection: its sequence numbers, and its newest intent."""
+    """The requests of one connection: their sequence numbers, and the newest intent."""
 
     __slots__ = ("_ended", "_floor", "_received", "newest", "seq")
 
@@ -154,7 +154,7 @@ class Intents:
         self.seq = -1  #: sequence number of the newest command received
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
-        self._floor = -1  # intents up to this one were ended by an event
+        self._floor = -1  # an event ended the intents up to this number
         self._ended = Fate.AUTHORITY  # fate of the intents that this event ends
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
@@ -211,7 +211,7 @@ class StatePolicy(Enum):
     """How to handle an action in a given flight state."""
 
     APPLY = auto()
-    HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
+    HOLD = auto()  #: accept the action without effect, because the state has been reached or a manoeuvre continues
     HOVER = auto()  #: if a take-off is requested in flight, hover instead
     REFUSE = auto()
 
@@ -252,7 +252,7 @@ class Decision(NamedTuple):
 class CommandChecks:
     """Decides how to handle the commands for one vehicle.
 
-    ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
+    ``supported``: the actions of the vehicle and the software autopilot. ``native``: the actions of the vehicle itself.
     ``why_not``: readable reasons why other actions are not available.
     """
 
@@ -281,7 +281,7 @@ class CommandChecks:
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
-        """Check sequence, age, lease and numbers. Returns None if they pass, which renews the holder's lease."""
+        """Check sequence, age, lease and numbers. Returns None if they pass. This renews the lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
@@ -338,7 +338,7 @@ class CommandChecks:
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def keeps_failsafe(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
-        """Return whether the ladder's task continues, rather than ends, when the holder's command is executed."""
+        """Return whether the ladder's task continues (or else ends) when the holder's command is executed."""
         ladder = self._ladder
         if automatic:
             return ladder.continues_landing or ladder.step is Failsafe.LAND
@@ -347,7 +347,7 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Return whether the position matters: it does for hovers in flight and for take-offs from the ground."""
+        """Return whether the position matters. It does for hovers in flight and for take-offs from the ground."""
         if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take over control
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
@@ -401,7 +401,7 @@ class CommandChecks:
 
 
 def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:
-    """Return why :meth:`Intents.check` refused a command, and what would be right, as readable text."""
+    """Return readable text about why :meth:`Intents.check` refused a command, and what would be right."""
     if reason is Refusal.OUT_OF_SEQUENCE:
         return f"number {command.seq} is not newer than {newest_seq}, the last one received"
     if reason is Refusal.STALE:

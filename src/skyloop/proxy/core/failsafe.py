@@ -12,7 +12,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 
-#: The charge must rise this far above a level before falling below it counts again.
+#: The charge must rise this far above a level before a fall below that level counts again.
 BATTERY_REARM: Final = 0.05
 
 #: Reasons for steps, as readable text.
@@ -32,11 +32,11 @@ REASONS: Final = {
 _RANK: Final = {Failsafe.NONE: 0, Failsafe.HOVER: 1, Failsafe.LAND: 2}
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
 _LAND_AT_START: Final = ReturnToStart(land=True)
-#: States that prove that an action accepted by the driver did not reach the vehicle.
+#: States that prove that an action which the driver accepted did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
-    ReturnToStart: frozenset(),  # the return is steered all the way
+    ReturnToStart: frozenset(),  # the whole return is steered
 }
 
 
@@ -62,12 +62,12 @@ class FailsafeInputs:
 
     state: FlightState
     airborne: bool
-    last_command_ns: int  #: when the last valid command arrived from any holder
+    last_command_ns: int  #: time at which the last valid command arrived from any holder
     pilot: str  #: ``held``, or why there is no holder: ``released``, ``silent``, ``gone``, ``expired``, ``none``
     link_up: bool  #: whether the link from proxy to vehicle is up
     battery: float | None
     ours: bool = True  #: whether an application of this proxy started the flight or took it over
-    return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
+    return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can or need not
     shown: bool = True  #: whether the state is current; if False, the vehicle is no longer received
 
 
@@ -133,7 +133,7 @@ class FailsafeLadder:
         self._closing = False
         self._warned = False
         self.battery_low = False  #: whether the charge has fallen below the level for a return and has not recovered
-        self._overruled = False  # whether the pilot has overruled a return because of the battery
+        self._overruled = False  # whether the pilot has overruled a return that began because of the battery
         self._wanted: FailsafeTask | None = None
         self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
         self.wanted_ns = 0  #: time at which the current task began
@@ -141,7 +141,7 @@ class FailsafeLadder:
         self._next_try_ns = 0
 
     def update(self, now_ns: int, inputs: FailsafeInputs) -> list[Effect]:
-        """Perform the steps that are due. Call at a steady pace, and at once after relevant changes."""
+        """Perform the steps that are due. Call at a steady pace, and immediately after relevant changes."""
         effects = self._battery(inputs)
         self.given_up &= inputs.airborne and not inputs.link_up
         if not inputs.airborne:
@@ -151,7 +151,7 @@ class FailsafeLadder:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
-        told = inputs  # the driver may not report a pilot's continued landing yet
+        told = inputs  # the driver may not report yet that a pilot continues a landing
         if isinstance(self._wanted, Land) or self.given_up:  # only a landing can follow
             told = replace(inputs, state=FlightState.LANDING)
         step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
@@ -167,7 +167,7 @@ class FailsafeLadder:
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
-        """End the step after a fresh command from the pilot, unless the vehicle lands for a lasting reason."""
+        """End the step after a fresh command from the pilot, unless the vehicle is landing for a lasting reason."""
         if self.barred:
             return []
         self._overruled |= self.lands_for_battery
@@ -196,7 +196,7 @@ class FailsafeLadder:
 
     @property
     def continues_landing(self) -> bool:
-        """Whether the ladder continues a pilot's landing."""
+        """Whether the ladder is continuing a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
     @property
@@ -215,7 +215,7 @@ class FailsafeLadder:
         return self._wanted is not None
 
     def give_up(self) -> None:
-        """Abandon a hover or a pilot's landing; a silent vehicle is made to land only if its pilot is silent, too."""
+        """Abandon a hover or a pilot's landing. A silent vehicle is made to land only if its pilot is silent, too."""
         self._wanted, self.given_up = None, True
 
     def order_landing(self) -> None:
@@ -252,7 +252,7 @@ class FailsafeLadder:
         return not self.barred and (reason == "battery_return" or self.settings.returns)
 
     def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:
-        """Begin a step, or change how it ends."""
+        """Begin a step, or change how the step ends."""
         self.step, self.reason = change.step, change.reason
         landing = _LAND_AT_START if change.returns else Land()
         self._want(landing if change.step is Failsafe.LAND else Hover(), now_ns)

@@ -1,8 +1,8 @@
-"""Track one flight: whether the vehicle is flying, whose flight it is, and how sure that is. Pure: time is an argument.
+"""Track one flight: whether the vehicle flies, whose flight it is, and how certain that is. Pure: time is an argument.
 
-The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
-mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
-that it is, never just because time has passed. ``docs/proxy.md`` describes the rules.
+The proxy steers only for a new intent of an application, or to end a flight that the proxy itself started. Arming,
+flying, mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle
+reports that it is, never just because time has passed. ``docs/proxy.md`` describes the rules.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ STANDING_NS: Final = nanoseconds(1.0)
 BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
 AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this height [m]
-STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent that makes no progress has reached the ground [m]
+STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent without progress has reached the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
 BLIND_NS: Final = 15 * NS_PER_S  #: after this time, the result of a landing without sensor data is unknown
@@ -50,12 +50,12 @@ class Whose(Enum):
     """Who started the flight, or has taken it over."""
 
     NOBODYS = auto()  #: as far as is known, the vehicle is not flying
-    OURS = auto()  #: an application of this proxy, or the proxy itself to end an application's flight
+    OURS = auto()  #: an application of this proxy, or the proxy itself while it ends that application's flight
     OTHERS = auto()  #: a remote control, a ground station or another program
 
 
 class Changed(NamedTuple):
-    """The flight has changed hands. ``why`` is the text to publish, empty if already published."""
+    """The flight has changed hands. ``why`` is the text to publish; it is empty if the change was already published."""
 
     whose: Whose
     why: str = ""
@@ -72,7 +72,7 @@ class Snapshot(NamedTuple):
 
 
 class Flight:
-    """The known state of one vehicle's flight; if the flight is ``shared``, others may fly the vehicle as well.
+    """The known state of one vehicle's flight. If the flight is ``shared``, others may fly the vehicle as well.
 
     :meth:`state` and :meth:`flies` acquire no lock and change nothing, so any thread may call them. Everything else is
     called under the command handler's lock. A vehicle steered in software without ``native`` take-off and landing has
@@ -90,15 +90,15 @@ class Flight:
         self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
         self._begun_ns = 0  # time at which the steered task began
-        self._was_up = False  # whether the vehicle has reported being in the air while steered
+        self._was_up = False  # whether the vehicle has reported being in the air while it was steered
         self._landed_ns: int | None = None  # time at which it first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
         self._blind_ns: int | None = None  # time at which a landing lost its sensor data
         self._sent_up = False  # whether the newest action makes the vehicle fly
-        self._seen_up = False  # whether it has been seen in the air, and not on the ground since
+        self._seen_up = False  # whether the vehicle has been seen in the air and, since then, not on the ground
 
-    # Does it fly? ------------------------------------------------------------------------------------------------
+    # Whether it flies -------------------------------------------------------------------------------------------
 
     def state(self, reported: FlightState) -> FlightState:
         """Return the flight state, given the state reported by the driver. Thread-safe."""
@@ -116,7 +116,7 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether the vehicle flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
+        """Return whether the vehicle flies, or may be flying, in a state returned by :meth:`state`. Thread-safe.
 
         In an unknown state, the vehicle counts as flying if it was seen flying or has been commanded to fly.
         """
@@ -212,7 +212,7 @@ class Flight:
         return None if self.whose is before else Changed(self.whose, self._change_text(before))
 
     def _observe_unsteered(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
-        """Observe a vehicle without a concept of flight while it is not steered."""
+        """Observe a vehicle without a concept of flight while it is not being steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
             if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot bypasses the driver

@@ -58,9 +58,9 @@ class StreamRate:
         self.wait_s = 0.0  #: minimum time that frames currently wait in the path [s]
         self.lost = 0  #: number of frames that were never acknowledged
         self._most_kbit_s = most_kbit_s
-        self._searches = True  # whether nothing has been late yet
+        self._searches = True  # whether no frame has been late yet
         self._silent = False  # whether the path has stalled
-        self._quiet_ns = 0  # start of the period with frames in flight but no acknowledgement; 0: none are in flight
+        self._quiet_ns = 0  # start of the period without an acknowledgement for frames in flight; 0: none are in flight
         self._returned_ns = now_ns - nanoseconds(SHORTEST_S)  # time at which the path resumed after a stall
         self._owed = False  # whether a frame must be sent immediately
         self._under_way: deque[_Sent] = deque()
@@ -68,7 +68,7 @@ class StreamRate:
         self._sent_ns = now_ns - nanoseconds(LOST_S)  # time at which the newest frame was sent
         self._delivered = 0
         self._shortest: deque[tuple[int, int]] = deque()  # round trips [ns] with their times, each longer than the last
-        self._waits: deque[tuple[float, int, int]] = deque()  # waits [s], their times, amount delivered until then
+        self._waits: deque[tuple[float, int, int]] = deque()  # waits [s], their times, and the amount delivered by then
         self._changed_ns = now_ns
         self._late_ns = now_ns - nanoseconds(LATE_EVERY_S)
 
@@ -177,7 +177,7 @@ class StreamRate:
 
 
 #: Factors for the frame's size, and fractions of the frames to send, best first. If the rate is too low for good frames
-#: with one entry, the next one is used.
+#: with one entry, the next entry is used.
 _LADDER: Final = ((1.0, 1.0), (0.75, 1.0), (0.5, 1.0), (0.5, 0.5), (0.25, 0.5))
 ENOUGH_BITS: Final = 0.05  #: bits per sent pixel below which compression blocks become visible
 

@@ -25,8 +25,8 @@ __all__ = ["LocalServer", "dial", "list_names", "names_of_others"]
 def dial(name: str, *, group: str | None = None) -> Dialer:
     """Return a dialer for a proxy on this host. ``group``: users who share its directory (default: ``SKYLOOP_GROUP``).
 
-    The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if it does not accept
-    the connection (it was killed, is stopped, or belongs to another user). It returns or raises within about a second.
+    The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if the proxy does not
+    accept the connection (it was killed, is stopped, or is another user's). It returns or raises within about a second.
     """
     _check_platform()
     from skyloop.transport.local.client import LocalClient

@@ -34,12 +34,12 @@ _log = logging.getLogger(__name__)
 
 
 class LocalClient(TransportClient):
-    """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`; it receives at once."""
+    """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`. It receives at once."""
 
     # The thread that holds ``_turn`` receives and delivers. It is either the receiving thread or an application's
     # thread that waits for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing the
     # packet to another thread takes a second wake-up, which costs as much as the whole path from the proxy. While a
-    # thread leads, the receiving thread stands by; it takes over once no thread has received for two milliseconds.
+    # thread leads, the receiving thread stands by. It takes over once no thread has received for two milliseconds.
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -126,7 +126,7 @@ class LocalClient(TransportClient):
     def _release(self, slot: int) -> None:
         packet = packets.release(slot)
         if self._receiver == threading.get_ident():
-            self._releases.append(packet)  # sent after the delivery, which another thread is waiting for
+            self._releases.append(packet)  # sent after the delivery, because another thread is waiting for the delivery
         else:
             self._send_own(packet)
 
@@ -180,7 +180,7 @@ class LocalClient(TransportClient):
             if not self._turn.locked():
                 return
 
-    # --- the thread that has the turn ---
+    # --- on the thread that has the turn ---
 
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
         """Deliver packets until ``over`` returns True or the connection ends.
@@ -210,7 +210,7 @@ class LocalClient(TransportClient):
                 continue  # packets sent earlier still arrive, followed by the end
             except OSError as error:
                 if error.errno is None:
-                    raise  # raised by a signal handler, not the kernel; for example, a TimeoutError
+                    raise  # a signal handler raised this, not the kernel; for example, a TimeoutError
                 return f"receiving failed: {error}"
             kind = packet[5:6]
             try:
@@ -313,7 +313,7 @@ class SlotView:
 
 
 class Lease:
-    """Owns a frame's pixels: as long as any array over them exists, the server does not reuse the slot."""
+    """Owns a frame's pixels. As long as any array over the pixels exists, the server does not reuse the slot."""
 
     __slots__ = ("__array_interface__", "_leases", "_slot")
 
@@ -349,7 +349,7 @@ class Leases:
                 del self._slots[slot.number]
 
     def end(self) -> None:
-        """Forget all slots at the end of the connection; frames that the application still holds stay valid.
+        """Forget all slots at the end of the connection. Frames that the application still holds stay valid.
 
         Those frames refer to this object, and the garbage collector does not search arrays for cycles. A reference from
         here to the client, its handler and the frames that it stores would therefore keep all of them alive forever.
@@ -371,6 +371,6 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """Return a slot to the server, now that the application's last array over it is gone."""
+        """Return a slot to the server, because the application's last array over it no longer exists."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)

@@ -3,8 +3,8 @@
 Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
 The variable ``SKYLOOP_RUNTIME_DIR`` sets it. The default is ``skyloop`` in the user's runtime directory. A
 process that changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is
-on the directory itself or, if a group may read the directory, on the file ``.lock`` in it, which only the owner can
-open, so that members of the group can't block a proxy. Reading needs no lock.
+on the directory itself. If a group may read the directory, the lock is on the file ``.lock`` in it, which only the
+owner can open, so that members of the group can't block a proxy. Reading needs no lock.
 
 The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket reveals whether a
 process is still listening. The kernel answers at once, without the owner noticing: ``EPROTOTYPE`` for a live socket and
@@ -121,7 +121,7 @@ class Directory:
         return found
 
     def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy, unless the lock is held, because a reader never waits."""
+        """Remove the socket of a killed proxy. Skip this if the lock is held, because a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
             return  # members of a group may read the directory, but can't remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
@@ -129,7 +129,7 @@ class Directory:
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
-        """Listen under a name, replacing a killed proxy; return the socket, and its file's inode for :meth:`remove`."""
+        """Listen under a name, replacing a killed proxy. Return the socket, and its file's inode for :meth:`remove`."""
         path = self.socket_path(name)
         self.create()
         with self.lock():
@@ -164,7 +164,7 @@ class Directory:
             path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
         try:
-            if path is not self.path and os.geteuid() == 0:  # root may have created it in another user's directory
+            if path is not self.path and os.geteuid() == 0:  # root may have created the directory for another user
                 os.fchown(descriptor, here.st_uid, -1)
             _lock(descriptor, path, timeout_s)
             yield
@@ -216,10 +216,10 @@ def is_live(path: Path) -> bool:
 
 
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user; we can't open their sockets.
+    """Return the names of other users' proxies on this host, by user. This process can't open their sockets.
 
-    ``table``: the content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
-    ``owner``: returns the user id of a directory's owner; None if unknown.
+    ``table``: the content of ``/proc/net/unix``, where the kernel lists the names of all sockets for every user.
+    ``owner``: returns the user id of a directory's owner; None if the owner is unknown.
     """
     found: dict[str, list[str]] = {}
     for line in table.splitlines():
@@ -234,7 +234,7 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
 
 
 def directory_owner(path: Path) -> int | None:
-    """Return the owner of a directory or, if it is not visible, of its nearest visible parent."""
+    """Return the owner of a directory or, if the directory is not visible, the owner of its nearest visible parent."""
     for folder in (path, *path.parents):
         with contextlib.suppress(OSError):
             return folder.lstat().st_uid
@@ -255,7 +255,7 @@ def owner_pid(path: Path) -> int | None:
 def connect(path: Path) -> Socket:
     """Connect to the socket at this path; ``OSError`` if no process accepts within :data:`CONNECT_TIMEOUT_S`."""
     sock = Socket()
-    # Without a time-out, connecting to a stopped process whose queue is full would block forever.
+    # Without a time-out, connecting to a stopped process with a full queue would block forever.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
     sock.connect(os.fspath(path))
     return sock

@@ -1,4 +1,4 @@
-"""Manage the server's frame slots: which are free, which clients hold them, and which viewers await a frame.
+"""Manage the server's frame slots: which slots are free, which clients hold them, and which viewers wait for a frame.
 
 A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
 :data:`MAX_LEASES` frames, or whose socket is full, is skipped. Once it releases a frame, it gets the newest frame.
@@ -43,7 +43,7 @@ class SlotMemory:
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that hold the slot, plus the server while it writes to it or keeps it for viewers
+        self.holders = 0  #: number of clients that hold the slot, plus the server while it writes or keeps it
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.posix_fallocate(self.fd, 0, capacity)  # if memory is short, fail here rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -85,12 +85,12 @@ class Viewer:
     connection: Connection
     leases: dict[int, SlotMemory] = field(default_factory=dict)
     announced: set[int] = field(default_factory=set)
-    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
+    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: no slots
     active: bool = True  #: whether the viewer gets frames; if not, it may still hold some of them
     waits: bool = False  #: whether the viewer was skipped and is waiting for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
-        """Send a frame, unless the viewer holds enough frames or its socket is full; then mark it as waiting."""
+        """Send a frame. If the viewer holds enough frames or its socket is full, mark it as waiting instead."""
         self.waits = True
         if len(self.leases) >= MAX_LEASES:
             return False
@@ -131,7 +131,7 @@ class Camera:
         """Return a slot for a frame. The writer holds the slot until :meth:`offer`. ``OSError``: out of memory."""
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
-            # The size of compressed frames varies, so when one outgrows its slots, new slots get some spare room.
+            # The size of compressed frames varies. When one outgrows its slots, new slots therefore get spare room.
             grows = geometry == self._geometry
             self.retire()
             self._geometry = geometry
@@ -176,12 +176,12 @@ class Camera:
         return True
 
     def subscribe(self, connection: Connection) -> None:
-        """Send frames to a connection, starting with the next one."""
+        """Send frames to a connection from the next frame on."""
         self.viewers.setdefault(connection, Viewer(connection)).active = True
         self._count_active()
 
     def unsubscribe(self, viewer: Viewer) -> None:
-        """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
+        """Stop sending frames to a viewer. Frames that the viewer holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
         with contextlib.suppress(OSError):  # if this fails, the slots stay mapped in the client until it ends
@@ -217,7 +217,7 @@ class Camera:
             viewer.retire_before = self._next_number
 
     def _keep(self, newest: _Newest | None) -> None:
-        """Keep a slot, or none, for waiting viewers; the writer's hold on ``newest`` is passed on to this object."""
+        """Keep a slot, or none, for waiting viewers. This object takes over the writer's hold on ``newest``."""
         before, self._newest = self._newest, newest
         if before is not None:
             self.drop(before[0])

@@ -25,14 +25,14 @@ class LocalKind(IntEnum):
     HELLO = 0x40  #: a client's first packet
     SUBSCRIBE = 0x41  #: client to server
     RELEASE = 0x42  #: client to server: the client no longer uses the frame in this slot
-    SLOT = 0x43  #: server to client, with the slot's descriptor
-    FRAME = 0x44  #: server to client: a slot holds a frame
+    SLOT = 0x43  #: server to client, together with the slot's descriptor
+    FRAME = 0x44  #: server to client: a slot contains a frame
     RETIRE = 0x45  #: server to client: the older slots of a camera will not be used again
     BYE = 0x46  #: either direction: the reason why the connection ends
     WAKE = 0x47  #: client to server: older applications send this before each command, and it is ignored
 
 
-# A packet's sixth byte is its kind, which is compared with these without conversion.
+# A packet's sixth byte is its kind. It is compared with these kinds without conversion.
 OWN: Final = bytes([LocalKind.HELLO])  #: packets of this kind and above are the transport's own
 FRAME: Final = bytes([LocalKind.FRAME])
 

@@ -55,17 +55,17 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: the lane in which the source waits
+        self.lane: Lane | None = None  #: the lane that the source waits in
         self.ended = False
         self.muted = False  #: whether the source is ignored until the next check
 
 
 class _Thread(threading.Thread):
-    """A reactor's thread."""
+    """The thread of a reactor."""
 
 
 class Reactor:
-    """Receives for transport servers on one thread, from construction to :meth:`close`."""
+    """Receives for transport servers on one thread, from construction until :meth:`close`."""
 
     def __init__(self) -> None:
         self.inside: SharedLocalServer | None = None  #: the server whose handler is running, or may be running
@@ -224,7 +224,7 @@ class Reactor:
             self._epoll.modify(source.fileno, 0)
 
     def _check(self) -> None:
-        """End connections that have sent nothing, and retry listeners."""
+        """End connections that have sent nothing, and retry listeners that failed."""
         now_s = time.monotonic()
         with self._lock:
             sources = list(self._sources.values())
@@ -241,7 +241,7 @@ class Reactor:
 class SharedLocalServer(LocalServer):
     """A :class:`LocalServer` that shares its receiving thread with others.
 
-    Its handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
+    The handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
     """
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
@@ -251,7 +251,7 @@ class SharedLocalServer(LocalServer):
         self._listening: Source | None = None
         self._inode = 0
         self._served: set[ServerConnection] = set()
-        self._left = threading.Condition()  # guards the set; notified when a connection is gone
+        self._left = threading.Condition()  # guards the set; notified when a connection has ended
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         listener.setblocking(False)
@@ -287,7 +287,7 @@ class SharedLocalServer(LocalServer):
     def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
         """Accept a connection, or read a packet from one; return whether more packets may be waiting.
 
-        ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
+        ``at_once``: nothing else is waiting for this thread, so a command is handled right here and not by
         :meth:`deliver`.
         """
         with self._lock:  # held from receiving to handling, so that nothing overtakes this packet after a split
@@ -332,7 +332,7 @@ class SharedLocalServer(LocalServer):
         """Return the lane in which to queue a source; None if it has no packets or is already in that lane."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
-            lane = Lane.STEERING  # it will be refused
+            lane = Lane.STEERING  # the request will be refused
         if lane is None or (source.lane is not None and source.lane <= lane):
             return None
         source.lane = lane
@@ -378,7 +378,7 @@ class SharedLocalServer(LocalServer):
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
-        """Handle one packet, surviving any error of the handler."""
+        """Handle one packet, and survive any error that the handler raises."""
         handler = self._handler
         assert handler is not None
         try:

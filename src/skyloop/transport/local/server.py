@@ -36,9 +36,9 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
+#: Connections allowed per process, so that no program takes them all. A cockpit page that flies has its own process.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: maximum per user with access through a group; the proxy's own user may use all others
+MAX_PER_USER: Final = 64  #: maximum per user who has access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: connections reserved for pilots
 HELLO_S: Final = 2.0  #: time limit for the first packet, which a client sends when it connects
 _RETRY_ACCEPT_S: Final = 0.2
@@ -58,14 +58,14 @@ class LocalServer(TransportServer):
         check_name(name)
         self._name = name
         self._directory = find_directory(group)
-        self._directory.socket_path(name)  # if the path is too long, raise here rather than on start
+        self._directory.socket_path(name)  # if the path is too long, raise here rather than in ``start``
         self._exchange = FrameExchange()
         # These are replaced under the lock and never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
-        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
+        self._peers: dict[int, ServerConnection] = {}  # the peers, by number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
-        self._lock = PriorityLock()  # a thread must hold it to call the handler
-        self._receivers: set[int] = set()  # identities of the receiving threads
+        self._lock = PriorityLock()  # a thread must hold this lock to call the handler
+        self._receivers: set[int] = set()  # identities of the threads that receive
         self._superseded = 0  # number of commands that were replaced because newer ones arrived behind them
         self._last_id = 0
         self._started = False
@@ -101,7 +101,7 @@ class LocalServer(TransportServer):
         self._finish(listener)
 
     def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
-        """Wait until everything has ended."""
+        """Wait until all ends have stopped."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
             thread.join()  # a handler that stops its own server must not wait for itself
@@ -159,7 +159,7 @@ class LocalServer(TransportServer):
     def address(self) -> str:
         return f"local:{self._name}"
 
-    # --- the accepting thread ---
+    # --- on the accepting thread ---
 
     def _run(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         threads: list[threading.Thread] = []
@@ -176,12 +176,12 @@ class LocalServer(TransportServer):
                 thread.join()
 
     def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
-        """Accept one connection and start receiving from it; return its receiving thread, or None."""
+        """Accept one connection and start receiving from it. Return its receiving thread, or None."""
         try:
             accepted, _ = listener.accept()
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
-                # Out of descriptors or memory: without a pause, this thread would spin.
+                # Out of descriptors or memory: without a pause, this thread would loop without rest.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
@@ -202,7 +202,7 @@ class LocalServer(TransportServer):
         return thread
 
     def _let_in(self, sock: Socket) -> ServerConnection | None:
-        """Return the caller's connection; None if it may not connect, or there is no room."""
+        """Return the caller's connection; None if the caller may not connect or there is no room."""
         who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
@@ -219,8 +219,8 @@ class LocalServer(TransportServer):
     def _make_room(self, who: Credentials) -> str:
         """Make room for a new connection; return why this is impossible, or an empty string.
 
-        If all places are taken, the oldest connection that has not identified itself gives way, so that such
-        connections can't keep others out, however many there are.
+        If all places are taken, the oldest connection that has not identified itself gives way, so that any number of
+        such connections can't keep others out.
         """
         with self._lock:
             present = [connection for connection in self._connections if not connection.ending]
@@ -284,12 +284,12 @@ class LocalServer(TransportServer):
                 return reason
 
     def _next(self, connection: ServerConnection) -> bytes:
-        """Read all waiting packets, and return the one to handle first. The caller holds the lock."""
+        """Read all waiting packets, and return the packet to handle first. The caller holds the lock."""
         self._superseded += connection.take_in()
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why it ends the connection, or an empty string. The caller holds the lock."""
+        """Handle one packet. Return why it ends the connection, or an empty string. The caller holds the lock."""
         if not packet or connection.ending:
             # An empty packet can't be distinguished from the end of the connection, so it is treated as the end.
             return f"the application is gone ({connection.peer.address})"

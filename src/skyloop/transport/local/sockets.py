@@ -54,7 +54,7 @@ class Socket(socket.socket):
 
 
 class Credentials(NamedTuple):
-    """The process at the other end, according to the kernel at the time of connecting."""
+    """The process at the other end, as the kernel identified it at the time of connecting."""
 
     pid: int
     uid: int
@@ -80,7 +80,7 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Return whether the connecting process has access: it is our own user's, the superuser's or a group member's."""
+    """Return whether the process may connect: as our own user, the superuser or a group member."""
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
@@ -95,7 +95,7 @@ def user_name(uid: int) -> str:
 
 
 def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long calls block [s] before ``EAGAIN``, by ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``; 0: no limit."""
+    """Limit how long calls block [s] before ``EAGAIN``, with ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``. 0 means no limit."""
     whole = int(seconds)
     sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
 
@@ -111,12 +111,12 @@ class ServerConnection:
         self.receive = sock.recv
         poll = select.poll()
         poll.register(sock, select.POLLIN)
-        self.poll = poll.poll  #: returns whether a packet, or the end, is waiting; for the receiving thread
+        self.poll = poll.poll  #: returns whether a packet or the end is waiting; for the receiving thread
         self.backlog = PacketBacklog()  #: packets that were taken from the socket but have not been handled yet
         self.peer = peer
         self.joined = False  #: whether the application has sent Hello, so that the handler knows about it
         self.admitted = False  #: whether the application has identified itself, so that the handler has admitted it
-        self.pilot = False  #: whether it connected as a pilot
+        self.pilot = False  #: whether the application connected as a pilot
         self.ending = False  #: whether the server is ending the connection, so that earlier packets no longer count
         self.reason = ""  #: the reason why the connection ends, once either end has given one
         self.topics: set[str] = set()
