@@ -1,8 +1,8 @@
 """A vehicle whose proxy runs in a separate process. The process is restarted when it dies.
 
-The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. It ends with its
-host, immediately and without a landing, just like a proxy inside the host's process. Each line of its standard output
-is a status for the host, in JSON.
+The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. The process ends
+with its host, immediately and without a landing, just like a proxy inside the host's process. Each line of its standard
+output is a status for the host, in JSON.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class OwnProcessVehicle(HostedVehicle):
         *,
         unless_flying: bool = False,
     ) -> bool:
-        """Ask the process to land the vehicle and end. It is not restarted."""
+        """Ask the process to land the vehicle and end. The vehicle is not restarted."""
         asked = self._runner.stopping
         child = self._runner.request_stop()
         if child is not None and child.code is None:

@@ -22,7 +22,7 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Number of rounds after which a proxy does everything again. This is ten times a second.
+#: Number of rounds after which a proxy does everything again, which is ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
@@ -240,9 +240,9 @@ class SharedLoop(Protocol):
 class Watchdog:
     """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
-    It counts its own checks rather than time. A loop on a suspended or overloaded machine is therefore not considered
-    hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for each call
-    that does not return. ``on_hang`` is called if that call still does not return.
+    The watchdog counts its own checks rather than time. A loop on a suspended or overloaded machine is therefore not
+    considered hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for
+    each call that does not return. ``on_hang`` is called if that call still does not return.
     """
 
     def __init__(

@@ -29,7 +29,7 @@ _COUNTERS: Final = (
     *("events.missed", "driver.errors"),
 )
 _NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
-#: Counters whose name contains a label. Given are the parts of the name before and after the label.
+#: Counters whose name contains a label. Each pair contains the parts of the name before and after the label.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
     "skyloop_events_total": ("events.of.", ""),

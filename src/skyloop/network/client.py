@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
 GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues with another session
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
-#: ended before they were re-established. It then mistakes the new links for additional links and announces nothing on
-#: them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
+#: ended before they were re-established. The node then mistakes the new links for additional links and announces
+#: nothing on them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
 STALLED_S: Final = 5.0  #: after this time without an acknowledgement, a proxy is considered gone
@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return a dialer for a proxy on the network. It may take up to ``find_s`` [s] to find the proxy.
+    """Return a dialer for a proxy on the network. The dialer may take up to ``find_s`` [s] to find the proxy.
 
     The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
     proxy does not admit the application.
@@ -180,7 +180,7 @@ class Subscription:
             self._enqueue(self, packet, number)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        """Queue a frame. It replaces a frame that is already queued."""
+        """Queue a frame, replacing any frame that is already queued."""
         opener = self._opener
         try:
             attachment = packets.copied(sample.attachment, packets.MAX_OWN)

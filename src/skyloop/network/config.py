@@ -278,8 +278,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
     else:
         found["region_name"] = _REGIONS[part]
-        # Don't act as a gateway for Zenoh "clients". They are not admitted, because all our nodes are peers. A gateway
-        # would forward the declarations of every client, and thousands of them would block it for seconds.
+        # Don't act as a gateway for Zenoh "clients". Such nodes are not admitted, because all our nodes are peers. A
+        # gateway would forward the declarations of every client, and thousands of them would block it for seconds.
         found["gateway"] = {"south": []}
     if settings.tls is not None:
         found["transport"]["link"]["tls"] = _tls(settings)

@@ -97,7 +97,7 @@ class ServerConnection:
             return self.outgoing.stalled_s(now_s)
 
     def queue_own(self, packet: bytes) -> None:
-        """Queue one of the transport's own packets. It is sent only once and may be lost."""
+        """Queue one of the transport's own packets. Such packets are sent only once and may be lost."""
         with self.lock:
             self._own.append(packet)
 
@@ -118,7 +118,7 @@ class ServerConnection:
             return found, self.outgoing.under_way and not self.ended
 
 
-#: Sends a packet to an application. Its number is 0 if it may be lost.
+#: Sends a packet to an application. The number is 0 if the packet may be lost.
 Put = Callable[[ServerConnection, bytes, int], object]
 
 

@@ -2,7 +2,7 @@
 
 The number of packets in flight is limited. Time is passed as an argument, and sending is left to the callers.
 
-Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router. It also drops
+Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router. Zenoh also drops
 packets that reach a node before the subscription does. Each numbered packet is therefore kept and resent until the
 other end acknowledges it. Only a few frames are in flight at once, to avoid congesting a slow path.
 """
@@ -158,8 +158,8 @@ class AckPolicy:
 class Pace:
     """Tracks whether the path to one subscriber delivers a topic's packets. One thread sends, another acknowledges.
 
-    A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams. They then delay all
-    later packets. Few packets are therefore sent to a silent subscriber.
+    A stalled path, such as a mobile network that is silent for seconds, still accepts datagrams. The datagrams then
+    delay all later packets. Few packets are therefore sent to a silent subscriber.
     """
 
     __slots__ = ("_acknowledged", "_eager", "_newest", "_sent_s", "_since_s")
@@ -206,8 +206,8 @@ class RecentPackets:
 class Receiver:
     """Receives packets at one end of a connection: numbered packets exactly once and in order, all others at most once.
 
-    The transport's own packets are passed to ``control``, which returns whether it handled them. All others are passed
-    to ``deliver``. Thread-safe. One thread at a time passes on numbered packets.
+    The transport's own packets are passed to ``control``, which returns whether it handled them. All other packets are
+    passed to ``deliver``. Thread-safe. One thread at a time passes on numbered packets.
     """
 
     def __init__(self) -> None:

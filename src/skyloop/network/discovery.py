@@ -77,7 +77,7 @@ def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
     """Return NAME and RUN of the transport servers whose tokens are currently visible.
 
-    This takes as long as the linked nodes need to send their tokens, but no more than :data:`SYNC_S`.
+    This call takes as long as the linked nodes need to send their tokens, but no more than :data:`SYNC_S`.
     """
     return listed(session, name)[0]
 
@@ -159,7 +159,7 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know about. If there are any, retire the session and return True."""
+    """Search for nodes that a session does not know about. If new ones answer, retire the session and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -192,7 +192,7 @@ class ProxyWatch:
     """Monitors which transport servers with a given name are alive.
 
     ``on_gone`` is called on one of Zenoh's threads with the run of each proxy that disappears. ``known``: the
-    description of a proxy with this name, if it was received earlier. It is then not requested again.
+    description of a proxy with this name, if it was received earlier. The description is then not requested again.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Send the server's video. Each subscribed variant of a frame is encoded once and sent at its readers' pace.
 
 Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until the reader acknowledges one.
-It then gets the newest frame. A slow link therefore shows fewer frames, but never old ones.
+The reader then gets the newest frame. A slow link therefore shows fewer frames, but never old ones.
 """
 
 from __future__ import annotations

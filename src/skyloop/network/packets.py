@@ -176,7 +176,7 @@ def parse(packet: bytes) -> Message:
 
 
 def parse_own(packet: bytes) -> Message | None:
-    """Decode one of the transport's own packets. Return None if it is meant for the handler, or is garbage."""
+    """Decode one of the transport's own packets. Return None if the packet is for the handler, or is garbage."""
     if not is_own(packet):
         return None
     try:

@@ -116,7 +116,7 @@ class ConnectionRegistry:
         return connection
 
     def is_shut_out(self, connection: ServerConnection) -> bool:
-        """Return whether a newer roster excludes the key of a connection. If it does, end the connection."""
+        """Return whether a newer roster excludes the key of a connection. If one does, end the connection."""
         if self._ring is None or connection.who not in self._ring.shut_out:
             return False
         self._shut_out(connection, _SHUT_OUT)
@@ -334,7 +334,7 @@ class ConnectionRegistry:
 
 
 class _TurnQueue(Generic[T]):
-    """One queue per connection. They take turns, so that one with many items doesn't delay the others."""
+    """One queue per connection. The connections take turns, so that one with many items doesn't delay others."""
 
     def __init__(self) -> None:
         self._order: deque[Hashable] = deque()
@@ -394,7 +394,7 @@ class HandlerQueue(Generic[T]):
             return self._others.count(of)
 
     def close(self) -> None:
-        """Stop :meth:`get` from waiting. It still returns items that are already queued."""
+        """Stop :meth:`get` from waiting. Items that are already queued are still returned."""
         with self._changed:
             self._closed = True
             self._changed.notify()

@@ -1,6 +1,6 @@
 """Seal packets end to end: no node between a proxy and its applications can read, change or replay them.
 
-The seal is ChaCha20-Poly1305 (RFC 8439). It also authenticates a packet's attachment and the key it travels by.
+The seal is ChaCha20-Poly1305 (RFC 8439). The seal also authenticates a packet's attachment and the key it travels by.
 Without keys, nothing is sealed. ``docs/wire-format.md`` describes the bytes.
 """
 
@@ -34,7 +34,7 @@ SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """Seal and opener for use without keys. They change nothing."""
+    """A seal and opener that change nothing, for use without keys."""
 
     tag = trailer = 0
 

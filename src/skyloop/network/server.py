@@ -253,7 +253,7 @@ class FabricServer(TransportServer):
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets. Return False if the handler must handle it (garbage)."""
+        """Handle one of the transport's own packets. Return False if the handler must handle the packet (garbage)."""
         if isinstance(message, packets.Taken):
             if connection.took(message.topic, message.number, time.monotonic()):
                 self._sender.wake(connection)

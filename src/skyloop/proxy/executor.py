@@ -62,7 +62,7 @@ class ActionExecutor:
 
     @property
     def state(self) -> FlightState:
-        """The current flight state. It may be more recent than the last feedback."""
+        """The current flight state, which may be more recent than the last feedback."""
         return self.flight.state(self._publisher.reported_state)
 
     @property
@@ -164,7 +164,7 @@ class ActionExecutor:
     def leave(self, now_ns: int) -> None:
         """Hover permanently. No further commands are sent.
 
-        If it has no native hover, a vehicle is also stopped, as far as a single set-point can do that.
+        A vehicle without a native hover is also stopped, as well as a single set-point can do that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)

@@ -368,8 +368,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. These also change without being written. Each
-    is therefore read again every time, and changes cause no event.
+    ``free``: parameters that any pilot may write without the authority. These parameters also change without being
+    written. Each parameter is therefore read again every time, and changes cause no event.
     """
 
     def __init__(

@@ -176,7 +176,7 @@ class Proxy:
         self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write an audit trail. It is closed when the proxy ends. Call before :meth:`start`."""
+        """Write an audit trail, and close it when the proxy ends. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
 
@@ -235,7 +235,7 @@ class Proxy:
 
         First, everything except landings and emergency stops is refused permanently, whether or not the vehicle is
         flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it
-        is left hovering if it can hover without the proxy. Otherwise it gets a final set-point of zero speed.
+        is left hovering if it can hover without the proxy. Otherwise the driver gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
         without the proxy is still landed, however much time has passed, because it would fall otherwise. With
@@ -325,7 +325,7 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection. Its name and role are unknown until its Hello."""
+        """Handle a new connection. The application's name and role are unknown until its Hello."""
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:

@@ -42,7 +42,7 @@ _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line of an audit trail. Its other fields depend on ``what``."""
+    """One line of an audit trail. The line's other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
@@ -175,7 +175,7 @@ class AuditTrail:
             self._queue.put(entry)
 
     def close(self) -> None:
-        """Write the remaining lines. This takes at most :data:`CLOSE_S`."""
+        """Write the remaining lines. Writing takes at most :data:`CLOSE_S`."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
 
@@ -200,7 +200,7 @@ class AuditTrail:
 
 
 def record_path(name: str) -> Path:
-    """Return a proxy's file. It is next to the proxy's socket, where only the proxy's user may write."""
+    """Return a proxy's file. The file is next to the proxy's socket, where only the proxy's user may write."""
     from skyloop.transport.local.directory import find_directory
 
     return find_directory().path / (name + NOTE_SUFFIX)

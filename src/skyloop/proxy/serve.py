@@ -199,7 +199,7 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
     """End several proxies at the same time with :meth:`Proxy.end`. Then raise the first of their errors.
 
-    Ctrl-C ends the wait for landings unless it is handled elsewhere. It is raised when all have ended.
+    Ctrl-C ends the wait for landings unless it is handled elsewhere, and is raised again when all have ended.
     """
     raised: list[Exception] = []
     with interrupt_deferred() as interrupted:

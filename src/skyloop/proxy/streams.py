@@ -1,8 +1,8 @@
 """Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
 A format with a fixed rate is shared by all who request it. A format named after a subscriber is for that subscriber
-alone. Its rate and size adapt to the path (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle itself sends H.264,
-such a stream forwards it while the path can carry it, and is otherwise encoded here.
+alone. The rate and size of such a format adapt to the path (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle
+itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One camera's H.264 in one format. Its thread calls ``publish``, or ``fail`` with a readable reason."""
+    """One camera's H.264 in one format. The form's thread calls ``publish``, or ``fail`` with a readable reason."""
 
     def __init__(
         self,

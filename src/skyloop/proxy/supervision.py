@@ -311,7 +311,7 @@ class FlightSupervisor:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
-        """Cancel a take-off that has had no visible effect yet. Return whether there was such a take-off.
+        """Cancel a take-off that has had no visible effect yet. Return whether a take-off was cancelled.
 
         A landing command sent to a vehicle on the ground cancels an arming that is still in progress.
         """

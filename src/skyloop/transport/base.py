@@ -1,7 +1,7 @@
 """The contract for all transports.
 
 A transport carries whole packets between one proxy (the *transport server*) and any number of applications (*transport
-clients*). It knows packets and topics, but not their meaning. An implementation must pass the tests in
+clients*). The transport knows packets and topics, but not their meaning. An implementation must pass the tests in
 :mod:`skyloop.transport.conformance`.
 
 - No call ever blocks on the other end. A packet that does not fit into the buffer at that moment is not sent, and the
@@ -125,12 +125,12 @@ class TransportServer(ABC):
         """Send a frame to every subscriber of its camera; return the number of subscribers that did *not* receive it.
 
         ``pixels``: ``header.size`` bytes of dtype uint8, in any shape, C-contiguous. Otherwise :class:`UsageError` is
-        raised. They may be reused after the call.
+        raised. The pixels may be reused after the call.
         """
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers. If there are none, samples need not be produced."""
+        """Return the number of a topic's subscribers. If a topic has no subscribers, samples need not be produced."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
         """Return why an application that has identified itself must leave; empty if it may stay (the default).
@@ -160,7 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks. They are called on its receiving thread, one at a time."""
+    """A transport client's callbacks. The callbacks run on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -200,8 +200,8 @@ class TransportClient(ABC):
 
         Meanwhile the handler runs on this thread, still one call at a time. Returns False if another thread is
         receiving. The caller must then wait as usual, and ``wake`` is called once, on another thread, when a retry may
-        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. It is called on this
-        thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
+        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. ``ready`` is called on
+        this thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
         """
         return False
 
@@ -241,7 +241,7 @@ class TransportClient(ABC):
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
-#: Valid names for proxies. Each can be used as the file name of a socket and as one chunk of a network key.
+#: Valid names for proxies. Each name can be used as the file name of a socket and as one chunk of a network key.
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 

@@ -12,7 +12,7 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, nearest first. It assigns its own numbers to their peers.
+    """One transport server that combines several, nearest first. The server assigns its own numbers to their peers.
 
     The handler gets one call at a time, as the contract requires. Ends with a command go first, then by arrival.
     """

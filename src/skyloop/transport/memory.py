@@ -48,7 +48,7 @@ _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end. Its :meth:`dial` is a :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
+    """A proxy's end. :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -61,7 +61,7 @@ class MemoryServer(TransportServer):
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect to this server. It must be running. The handler runs on the client's own receiving thread."""
+        """Connect to this server. The server must be running. The handler runs on the client's own receiving thread."""
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"{self.address} has no server: start the transport server first")

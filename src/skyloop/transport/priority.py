@@ -129,7 +129,7 @@ def _command(packet: bytes) -> Command | None:
 
 
 class PriorityLock:
-    """A re-entrant lock. Each holder hands it to the thread that waits next.
+    """A re-entrant lock. Each holder hands the lock to the thread that waits next.
 
     ``with lock`` waits behind all other threads; ``lock.acquire(urgent=True)`` waits only behind other urgent ones.
     """

@@ -1,8 +1,8 @@
 """Create, read and check X.509 certificates of a lab's authority and identities. Times are passed as arguments, in UTC.
 
-The certificate's common name is the identity's name, which Zenoh's access control uses. Its role and drones are in the
-URI ``urn:skyloop:ROLE:DRONES`` among the alternative names. Only certificates of proxies and routers may accept
-connections (extended key usage), so that nobody can impersonate a proxy with the key of a pilot or an observer.
+The certificate's common name is the identity's name, which Zenoh's access control uses. The identity's role and drones
+are in the URI ``urn:skyloop:ROLE:DRONES`` among the alternative names. Only certificates of proxies and routers may
+accept connections (extended key usage), so that nobody can impersonate a proxy with the key of a pilot or an observer.
 """
 
 from __future__ import annotations

@@ -43,8 +43,8 @@ _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so
 _NO_WAY_M: Final = 0.05  # this close to the target, there is no meaningful direction to apply limits to
 _PASSES: Final = 8  # maximum number of passes in which all walls in turn reduce a velocity before a stop is required
 
-#: Permitted climb rate for each metre below ``limits.altitude`` [1/s]. It slows the vehicle down as it approaches that
-#: altitude. Above the limit, the vehicle sinks at the same rate per metre.
+#: Permitted climb rate for each metre below ``limits.altitude`` [1/s]. This limit slows the vehicle down as it
+#: approaches that altitude. Above the limit, the vehicle sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
 #: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
 SLACK_M: Final = 0.15
@@ -250,7 +250,7 @@ class Airspace:
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
         """Return the nearest set-point that the walls allow, the limits applied, and whether the position is known.
 
-        If it is not, the set-point is unchanged.
+        If the position is unknown, the set-point is unchanged.
         """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
@@ -375,7 +375,7 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        # It is reported only once, because the direction changes near the target.
+        # The limit is reported only once, because the direction changes near the target.
         if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:

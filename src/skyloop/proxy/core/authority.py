@@ -286,7 +286,7 @@ class Authority:
         return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
 
     def _change_term(self, term_ns: int | None, now_ns: int) -> None:
-        """Set the holder's remaining time. It can't be extended while others wait. None leaves it unchanged."""
+        """Set the holder's remaining time. The time can't be extended while others wait. None leaves it unchanged."""
         if term_ns is None:
             return
         until_ns = now_ns + term_ns

@@ -1,8 +1,8 @@
 """The software autopilot: take-off, hover, land, velocity and position for vehicles that lack these actions. Pure.
 
-It also handles the return to the take-off position, for all vehicles. A return is a series of targets, each judged as
-for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start,
-and a landing or hover there. The caller steps both. ``docs/proxy.md`` describes the rules of the return.
+The autopilot also handles the return to the take-off position, for all vehicles. A return is a series of targets, each
+judged as for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above
+the start, and a landing or hover there. The caller steps both. ``docs/proxy.md`` describes the rules of the return.
 
 A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
 a velocity loop (proportional and integral, the usual cascade for small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,

@@ -196,7 +196,7 @@ class Intents:
         return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
-        """Handle an emergency stop. It is executed regardless of its sequence number, and ends all requests."""
+        """Handle an emergency stop. The stop is executed regardless of its sequence number, and ends all requests."""
         assert type(command.action) is EmergencyStop
         self.seq, self._received = max(self.seq, command.seq), max(self._received, command.intent)
         self.end(Fate.EMERGENCY)
@@ -276,12 +276,12 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: Actions that a person may command while nothing is received from the vehicle. It may still receive our
-        #: commands. Without us, only the emergency stop could bring it down.
+        #: Actions that a person may command while nothing is received from the vehicle. The vehicle may still receive
+        #: our commands. Without us, only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
-        """Check sequence, age, lease and numbers. Returns None if they pass. This renews the lease."""
+        """Check sequence, age, lease and numbers. Returns None if the command passes, which renews the lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
@@ -293,7 +293,7 @@ class CommandChecks:
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide on a command whose intent is in progress. It must not be an emergency stop or idle.
+        """Decide on a command whose intent is in progress. The command must not be an emergency stop or idle.
 
         ``new``: whether this is a new request, and neither a repeat nor one that the library makes (``automatic``).
         """

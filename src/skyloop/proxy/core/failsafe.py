@@ -1,7 +1,7 @@
 """The failsafe ladder. It decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
 
-Steps escalate automatically (none, hover, land). They end only with a fresh command or on the ground. The vehicle may
-first fly back to its start, if parameters require this and nothing prevents it. ``docs/proxy.md`` has the rules.
+Steps escalate automatically (none, hover, land). The steps end only with a fresh command or on the ground. The vehicle
+may first fly back to its start, if parameters require this and nothing prevents it. ``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations

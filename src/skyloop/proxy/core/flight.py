@@ -62,7 +62,7 @@ class Changed(NamedTuple):
 
 
 class Snapshot(NamedTuple):
-    """The known state of the vehicle for one decision. It is read once and passed on."""
+    """The known state of the vehicle for one decision. The snapshot is read once and passed on."""
 
     now_ns: int
     state: FlightState

@@ -51,7 +51,7 @@ class _Sent:
 
 
 class StreamRate:
-    """The rate of one stream to one subscriber. It never exceeds ``most_kbit_s``. Not thread-safe."""
+    """The rate of one stream to one subscriber, limited to ``most_kbit_s``. Not thread-safe."""
 
     def __init__(self, most_kbit_s: int, now_ns: int) -> None:
         self.kbit_s = float(min(START_KBIT_S, most_kbit_s))  #: the current rate

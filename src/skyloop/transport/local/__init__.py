@@ -1,8 +1,8 @@
 """The transport within one host: a Unix ``SOCK_SEQPACKET`` connection per application, and sealed shared memory.
 
 The kernel keeps packets whole, reports the death of the other end at once, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later. On other systems, no proxies are listed, and any other use of this
-package raises :class:`UnsupportedError`.
+behind after a crash. The transport needs Linux 5.1 or later. On other systems, no proxies are listed, and any other use
+of this package raises :class:`UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def list_names(*, group: str | None = None) -> list[Proxy]:
 
 
 def names_of_others() -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user. This user can't reach them."""
+    """Return the names of other users' proxies on this host, by user. This user can't reach these proxies."""
     if sys.platform != "linux":
         return {}
     from skyloop.transport.local.directory import directory_owner, of_others

@@ -60,7 +60,7 @@ class Directory:
         self._suffix = _SUFFIXES[kind]
 
     def socket_path(self, name: str) -> Path:
-        """Return the path of a proxy's socket. It must not be longer than :data:`MAX_PATH`."""
+        """Return the path of a proxy's socket. The path must not be longer than :data:`MAX_PATH`."""
         check_name(name)
         path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
@@ -180,7 +180,7 @@ class Directory:
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return this user's directory, or the one that a group shares (``SKYLOOP_GROUP``). It touches no files."""
+    """Return this user's directory, or the one that a group shares (``SKYLOOP_GROUP``). No files are touched."""
     group = group or os.environ.get(GROUP_VARIABLE) or None
     configured = os.environ.get(DIRECTORY_VARIABLE)
     if group is not None and not configured:

@@ -32,7 +32,7 @@ class LocalKind(IntEnum):
     WAKE = 0x47  #: client to server: older applications send this before each command, and it is ignored
 
 
-# A packet's sixth byte is its kind. It is compared with these kinds without conversion.
+# A packet's sixth byte is its kind. The byte is compared with these kinds without conversion.
 OWN: Final = bytes([LocalKind.HELLO])  #: packets of this kind and above are the transport's own
 FRAME: Final = bytes([LocalKind.FRAME])
 
