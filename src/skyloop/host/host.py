@@ -60,7 +60,7 @@ class Host:
         self._make_driver = make
         self._overview = OverviewRegistry()
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
-        self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by giving only their name
+        self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
         self._reactor = Reactor()  # the reactor for vehicles that are added later
         self._ticker = Ticker(self._on_failing)
@@ -189,7 +189,7 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks it."""
+        """Return whether new vehicles may join this loop. If not, it belongs to a vehicle whose driver blocks it."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:

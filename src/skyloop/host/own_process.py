@@ -64,7 +64,7 @@ class OwnProcessVehicle(HostedVehicle):
         self._announce = announce
         self._changed = threading.Condition()  # guards all of the following attributes
         self._reported: VehicleStatus | None = None  # the status that the current process reported
-        self._silent_checks = 0  # number of checks since it last sent a report
+        self._silent_checks = 0  # number of checks since the process last sent a report
         self._deaths = 0  # number of deaths in a row
         self._runner = RestartingChild(
             [*command, settings.name],

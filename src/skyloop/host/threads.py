@@ -376,7 +376,7 @@ class LinkThread:
         return queue[0][0] if queue else None
 
     def _due(self, now_ns: int) -> set[ServedLink]:
-        """Return the links that are due. The caller holds the lock."""
+        """Return the links that are due for polling. The caller holds the lock."""
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]

@@ -243,7 +243,7 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 def within(call: Callable[[], object], seconds: float) -> bool:
     """Run a function that may hang on a separate thread, and raise its exceptions on this one.
 
-    Returns whether the call returned in time. Otherwise, the daemon thread continues to run.
+    Returns whether the function returned in time. Otherwise, the daemon thread continues to run.
     """
     raised: list[BaseException] = []
 

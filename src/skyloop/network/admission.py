@@ -34,7 +34,7 @@ class Admission(NamedTuple):
     welcome: bytes = b""  #: the proxy's answer
     offer: bytes = b""  #: the proof contained in the request
     identity: Identity | None = None  #: the proven identity of the other end
-    expires: datetime | None = None  #: expiry of its key
+    expires: datetime | None = None  #: time at which its key expires
     sealer: Sealer = PLAIN  #: seals packets sent to the other end
     opener: Opener = PLAIN  #: opens packets received from the other end
     topics: Opener = PLAIN  #: opens published packets (in the application)

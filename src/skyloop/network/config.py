@@ -31,7 +31,7 @@ OPEN_MS: Final = 800
 #: half-open link at the other end. Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
 OPEN_GIVEN_MS: Final = 1500
 #: How long a session waits to discover others when it is opened (Zenoh's default). An application with one address
-#: waits only for the proxy at that address. With several addresses, it must find every proxy with the name.
+#: waits only for the proxy at that address. With several, it must find all proxies with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
 #: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
@@ -94,7 +94,7 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """Time that a silence may last beyond the default [s]."""
+        """How much longer than the default a silence may last [s]."""
         return self.lease_s - LEASE_S
 
     @property

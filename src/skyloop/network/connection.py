@@ -70,7 +70,7 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record which packets of a topic, or (if empty) of those to it alone, the application has acknowledged.
+        """Record up to which packet the application has acknowledged a topic (if empty, the packets to it alone).
 
         Returns whether more packets that go only to this application may be waiting.
         """
@@ -85,7 +85,7 @@ class ServerConnection:
             return False
 
     def queue(self, packet: bytes) -> str:
-        """Keep a packet until it is acknowledged. Return why there is no room for it, or an empty string."""
+        """Keep a packet until it is acknowledged. Return why there is no room for the packet, or an empty string."""
         with self.lock:
             if self.outgoing.put(packet):
                 return ""

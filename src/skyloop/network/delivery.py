@@ -57,7 +57,7 @@ class Outgoing:
     def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
         """Keep another packet, sent by the key ``way``, until it is acknowledged; return False if there is no room.
 
-        ``own``: whether it is one of the transport's own small packets. Extra room is reserved for these.
+        ``own``: whether it is one of the transport's own small packets. Extra room is reserved for such packets.
         """
         if own:
             full = len(self._kept) >= 2 * self._depth

@@ -50,14 +50,14 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
-        runs(session)  # once the host has answered this request, all reachable nodes are known
+        runs(session)  # once this request has been answered, all reachable nodes are known
         return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
     finally:
         release(session)
 
 
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
-    """Return the proxies with this name, oldest first. There are several only if a network was temporarily split."""
+    """Return the proxies with this name, oldest first. There are several only if a network was split."""
     if not settings.multicast and not settings.connect:
         return []  # other nodes would have to connect to this one, which does not listen yet
     session = acquire(replace(settings, listen=()), Part.APP)

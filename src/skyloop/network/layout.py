@@ -100,7 +100,7 @@ def topic(name: str, topic_name: str) -> str:
 
 
 def newest_wins(topic_name: str) -> bool:
-    """Return whether only a topic's newest packet matters. It may then be lost, and never waits for earlier ones."""
+    """Return whether only a topic's newest packet matters. Such a packet may be lost, and never waits for others."""
     return topic_name.partition("?")[0] == FEEDBACK  # feedback in any variant
 
 

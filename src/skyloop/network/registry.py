@@ -34,8 +34,8 @@ STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
 T = TypeVar("T")
-#: After this number of consecutive commands, handle one other packet, so that an endless series of commands can't stop
-#: others from requesting authority.
+#: After this number of consecutive commands, handle one other packet, so that endless commands can't stop others from
+#: requesting authority.
 IN_A_ROW: Final = 16
 
 #: Items for the thread that calls the handler: a packet, True if the application has joined, or False if it has left.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = 2.0  #: an unused session stays open this long in case clients reconnect
+LINGER_S: Final = 2.0  #: an unused session stays open this long, in case clients reconnect
 REOPEN_S: Final = 2.0  #: time to wait for an address to become free again
 CLOSE_S: Final = 5.0  #: time that the process waits at exit for a session to close
 _BORROWED: Final = 1000  # number of retries when another thread is using the object …
@@ -35,7 +35,7 @@ Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: The Zenoh p
 
 
 class Session:
-    """A shared Zenoh session. Return it with :func:`release`."""
+    """A shared Zenoh session. Give it back with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
@@ -113,7 +113,7 @@ def reason_of(error: BaseException) -> str:
 
 
 class _Pool:
-    """All of this process's sessions. A thread closes unused ones, and ends when none are left."""
+    """All of this process's sessions. A thread closes unused sessions, and ends when none are left."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -138,7 +138,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Return a session. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
+        """Give a session back. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -257,7 +257,7 @@ def undeclare(held: Iterable[Any]) -> None:
                 each.undeclare()
             except ended:  # the session has ended, and its declarations with it
                 break
-            except RuntimeError:  # "Already borrowed": another thread is using the object to send
+            except RuntimeError:  # "Already borrowed": another thread is sending with the object
                 time.sleep(_BORROWED_S)
             else:
                 break

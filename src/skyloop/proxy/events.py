@@ -294,7 +294,7 @@ def taken_event(name: str, action: str, others: str) -> EventDraft:
 
 
 def ownership_event(changed: Changed) -> EventDraft:
-    """Return the event for a flight that is someone else's, or from an earlier run."""
+    """Return the event for a flight that is not this proxy's, or that an earlier run began."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
 

@@ -247,7 +247,7 @@ class ReturnSupervisor:
         return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
     def _fly(self, seen: Snapshot) -> None:
-        """Take the next step of the ladder's return. The ladder handles any objections."""
+        """Take the next step of the ladder's return to the start. The ladder handles any objections."""
         now_ns = seen.now_ns
         if not seen.link_up:
             self._good_ns = now_ns  # nothing is known, so there is no objection

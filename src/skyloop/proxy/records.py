@@ -52,7 +52,7 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     identity: str = ""  #: what the transport knows about the process: process and user, or the name in its certificate
     lease: int = 0
     priority: int = 0
-    how: str = ""  #: why a lease, or the run, ended; for ``begin``, the vehicle's address
+    how: str = ""  #: why a lease or the run ended; for ``begin``, the vehicle's address
 
 
 class Tenure(msgspec.Struct, frozen=True):

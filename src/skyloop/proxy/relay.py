@@ -67,7 +67,7 @@ class Relay:
         self._counts = counters.counts
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
-        """Relay an annotation to its subscribers. Return why it is malformed, or an empty string."""
+        """Relay an annotation to its subscribers. Return why the annotation is malformed, or an empty string."""
         if unknown := camera_problem(annotation.camera, self._cameras):
             return f"an annotation of an unknown frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
@@ -75,7 +75,7 @@ class Relay:
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Relay a log entry to its subscribers. Return why it is malformed, or an empty string."""
+        """Relay a log entry to its subscribers. Return why the entry is malformed, or an empty string."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:

@@ -40,7 +40,7 @@ Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
 class LinkLines:
-    """Composes the lines for the terminal about a proxy's vehicle link: one per change of the link or its reason."""
+    """Composes the terminal output about a proxy's vehicle link: one line per change of the link or its reason."""
 
     def __init__(self, name: str, where: str, now_ns: int) -> None:
         """Initialise; ``where`` names the vehicle and the address that serves it."""

@@ -83,7 +83,7 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own stream may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether that stream is being forwarded; this requires that its frames keep arriving
+        self._passing = False  # whether that stream is being forwarded; True only while its frames keep arriving
         self._own_ns = 0  # time at which its newest frame arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()

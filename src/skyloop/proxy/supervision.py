@@ -273,7 +273,7 @@ class FlightSupervisor:
         return None if holder is None else self._sessions.get(holder.app_id)
 
     def _asked(self, *kinds: type[Action]) -> Intent | None:
-        """Return the holder's intent if it is in progress and of one of these kinds."""
+        """Return the holder's intent if it is in progress and is of one of these kinds."""
         session = self._holder
         newest = None if session is None else session.intents.newest
         return newest if newest is not None and type(newest.action) in kinds and not newest.over else None

@@ -31,7 +31,7 @@ from skyloop.transport.base import (
     video,
 )
 
-#: The topics whose names are fixed.
+#: The topics whose names never change.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
 PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
@@ -42,7 +42,7 @@ MAX_VARIANTS: Final = 16  #: maximum number of simultaneous feedback variants, e
 #: How long a requested variant keeps its place without subscribers, because a subscription may be in transit.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
-_FRESH_NS: Final = PERIOD_NS // 2  # an overview younger than this is sent again instead of a new one
+_FRESH_NS: Final = PERIOD_NS // 2  # if an overview is younger than this, it is sent again instead of a new one
 _replace = msgspec.structs.replace
 
 
@@ -185,7 +185,7 @@ class OverviewRegistry:
             self._made_ns = None
 
     def remove(self, row: Callable[[], VehicleOverview]) -> None:
-        """Remove a vehicle. Does nothing if it is unknown."""
+        """Remove a vehicle. Does nothing if the vehicle is unknown."""
         with self._lock:
             self._sources.pop(row, None)
             self._made_ns = None

@@ -182,7 +182,7 @@ class TransportClient(ABC):
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the proxy. Return whether it was handed over to Zenoh. Any thread."""
+        """Send a packet to the proxy. Return whether the packet was handed over to Zenoh. Any thread."""
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
@@ -200,8 +200,8 @@ class TransportClient(ABC):
 
         Meanwhile the handler runs on this thread, still one call at a time. Returns False if another thread is
         receiving. The caller must then wait as usual, and ``wake`` is called once, on another thread, when a retry may
-        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. ``ready`` is called on
-        this thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
+        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. It is called on this
+        thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
         """
         return False
 

@@ -112,7 +112,7 @@ class _EndHandler:
         self._lock = whole.lock
         self._end = end
         self._handler = handler
-        self._peers: dict[int, Peer] = {}  # our peers, by the numbers that the end gave them
+        self._peers: dict[int, Peer] = {}  # our peers, by the numbers that the end assigned
 
     def peer_joined(self, peer: Peer) -> None:
         with self._lock:

@@ -47,7 +47,7 @@ class TransportSuite(ABC):
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
-        """Return a dialer to a server from :meth:`make_server`. The server may not be started.
+        """Return a dialer to a server from :meth:`make_server`, whether or not the server is running.
 
         It raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the server does
         not run.

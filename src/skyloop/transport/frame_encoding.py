@@ -48,7 +48,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
-        # The first pixel's centre is at (0, 0). Scaling therefore leaves its corner at (-0.5, -0.5) in place.
+        # The first pixel's centre is at (0, 0). Scaling therefore leaves that pixel's corner at (-0.5, -0.5) in place.
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )

@@ -6,8 +6,8 @@ newer set-point replaces an older one. One-off requests (take-off, landing, hove
 repeats of the same request are merged.
 
 Several threads share a :class:`PriorityLock` in order of arrival, commands first. A ``threading.RLock`` goes to any
-thread that is awake. A thread that re-acquires it in a loop can starve all others, and a command would wait behind two
-hundred requests from another application.
+thread that is awake. A thread that re-acquires the lock in a loop can starve all others, and a command would wait
+behind two hundred requests from another application.
 """
 
 from __future__ import annotations

@@ -189,7 +189,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is one of an authority. ``key`` is None on machines that issue no certificates."""
+    """Check that a certificate belongs to an authority. ``key`` is None on machines that issue no certificates."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:

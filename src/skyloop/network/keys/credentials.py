@@ -265,7 +265,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file atomically. A private file is readable only by its owner, from the first byte on."""
+    """Replace a file atomically. A private file is readable only by its owner, from the moment of its creation."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)

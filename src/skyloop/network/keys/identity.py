@@ -42,7 +42,7 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 class KeyRole(StrEnum):
-    """What a key permits its owner to do with the drones of its identity."""
+    """What a key permits its owner to do with the identity's drones."""
 
     PILOT = "pilot"  #: may observe every drone, and fly its own
     OBSERVER = "observer"  #: may observe its drones, but not fly any

@@ -9,7 +9,7 @@
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
 separate authority, in a folder next to the lab's key folder. Users make their browsers trust it. This is safe because
-the authority can't certify anything beyond private networks. Its key and the lab's key can't replace each other.
+the authority can't certify anything beyond private networks. The two keys can't replace each other.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust

@@ -23,7 +23,7 @@ from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
 LOST_NS: Final = 2 * NS_PER_S  #: if a position is older than this, the next one is not worth waiting for
-BLIND_M: Final = 0.5  #: maximum distance between walls that is flown towards a target without a new measured position
+BLIND_M: Final = 0.5  #: maximum distance flown towards a target between walls without a new measured position
 #: A position counts as having jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
 MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further out, the vehicle may only move back
@@ -429,7 +429,7 @@ class Airspace:
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """Return the age of the newest position [s], even if it is a repeat."""
+        """Return the age of the newest position [s], even if that position is a repeat."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:

@@ -19,7 +19,7 @@ class QueueEntry:
     """An application that holds or awaits the authority. Entries sort in the order in which they get the authority."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of the first request that it sent since it was last neither holder nor in the queue
+    arrival: int  #: number of the application's first request since it was last neither holder nor waiting
     app_id: int
     term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
     #: When the holder's time to answer the application's request is over; None if the holder was not asked.
@@ -330,13 +330,13 @@ class Authority:
         return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
-        """Hand the authority over if this is due. Then report changed positions in the queue."""
+        """Hand the authority over if this is due. Then report each application's changed position in the queue."""
         return self._hand_over(now_ns) + self._moved(now_ns)
 
     def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first application in the queue if this is due.
 
-        This is the case if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
+        This is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """
         effects: list[Effect] = []
         holder = self.holder

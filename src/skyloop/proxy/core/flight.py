@@ -29,7 +29,7 @@ from skyloop.messages import (
 CLAIM_NS: Final = nanoseconds(15.0)
 #: If the vehicle takes off although the take-off was cancelled, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over after this time on the ground. Shorter bounces and brief false reports therefore don't end it.
+#: A flight is over after this time on the ground. Shorter bounces and brief false reports therefore don't end a flight.
 STANDING_NS: Final = nanoseconds(1.0)
 #: How long a flight that can't be observed still counts as this proxy's. After that, it may be a different flight.
 BELIEF_NS: Final = nanoseconds(60.0)
@@ -91,7 +91,7 @@ class Flight:
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
         self._begun_ns = 0  # time at which the steered task began
         self._was_up = False  # whether the vehicle has reported being in the air while it was steered
-        self._landed_ns: int | None = None  # time at which it first reported being landed while steered
+        self._landed_ns: int | None = None  # time at which the vehicle first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
         self._blind_ns: int | None = None  # time at which a landing lost its sensor data
@@ -278,8 +278,8 @@ class Flight:
         """Return whether the steered task has ended on the ground, in which case the vehicle is no longer steered.
 
         If the vehicle reports its state, that report decides. Otherwise, a descent has reached the ground when the
-        altimeter reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and
-        its result is unknown. ``feedback``: as in :meth:`observe`.
+        altimeter reads a low altitude and shows no progress. A landing with neither report nor altimeter continues for
+        :data:`BLIND_NS`, and its result is unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:

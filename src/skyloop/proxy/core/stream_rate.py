@@ -22,15 +22,15 @@ LEAST_KBIT_S: Final = 60
 #: The initial rate. Isolated late frames do not reduce the rate further: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
-STANDING_S: Final = 0.25  #: the shortest wait within this time is due to a standing queue
+STANDING_S: Final = 0.25  #: the shortest wait within this time counts as a standing queue
 LONG_WAIT_S: Final = 0.06  #: the rate falls if the wait in a standing queue is longer than this
-FALL: Final = 0.85  #: fraction of the delivery rate that the rate then falls to
+FALL: Final = 0.85  #: fraction of the delivery rate to which the rate then falls
 GOOD_WAIT_S: Final = 0.03  #: the rate grows if the wait in a standing queue is shorter than this
 LATE_S: Final = 0.1  #: a single frame that has waited this long is late
 LATE_FALL: Final = 0.7  #: factor for the rate after a late frame
 LATE_EVERY_S: Final = 0.15  #: all late frames within this time reduce the rate only once
 GROWTH_1_S: Final = 0.1  #: growth of the rate per second
-SEARCH_1_S: Final = 2.0  #: the same below the initial rate, or while no frame has been late
+SEARCH_1_S: Final = 2.0  #: growth per second below the initial rate, or while no frame has been late
 MOST_WAIT_S: Final = 0.08  #: maximum delivery time of the frames in flight, beyond the shortest round trip
 SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled (the rate is not the cause)
 SILENT_FALL: Final = 0.5  #: factor for the rate after a stall, because the path's rate is then uncertain
@@ -94,7 +94,7 @@ class StreamRate:
         return len(under_way) < 2 or self._holds(seconds(least_ns) + MOST_WAIT_S)
 
     def _holds(self, time_s: float) -> bool:
-        """Return whether the amount in flight is no more than the rate delivers in this time [s]."""
+        """Return whether the rate delivers everything that is in flight within this time [s]."""
         return self._bytes * 8e-3 <= self.kbit_s * time_s
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:

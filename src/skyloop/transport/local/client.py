@@ -126,7 +126,7 @@ class LocalClient(TransportClient):
     def _release(self, slot: int) -> None:
         packet = packets.release(slot)
         if self._receiver == threading.get_ident():
-            self._releases.append(packet)  # sent after the delivery, because another thread is waiting for the delivery
+            self._releases.append(packet)  # sent after the delivery, because another thread is waiting for that
         else:
             self._send_own(packet)
 
@@ -279,7 +279,7 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """A client's view of one slot. The slot is mapped once and is read-only."""
+    """One client's view of a slot. The slot is mapped once and is read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 

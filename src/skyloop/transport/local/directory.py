@@ -1,7 +1,7 @@
 """The directory of sockets, where proxies are found by name, and its access rules.
 
 Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
-The variable ``SKYLOOP_RUNTIME_DIR`` sets it. The default is ``skyloop`` in the user's runtime directory. A
+The variable ``SKYLOOP_RUNTIME_DIR`` sets the directory. The default is ``skyloop`` in the user's runtime directory. A
 process that changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is
 on the directory itself. If a group may read the directory, the lock is on the file ``.lock`` in it, which only the
 owner can open, so that members of the group can't block a proxy. Reading needs no lock.

@@ -1,6 +1,6 @@
-"""Manage the server's frame slots: which slots are free, which clients hold them, and which viewers wait for a frame.
+"""Manage the server's frame slots: which are free, which clients hold them, and which viewers wait for a frame.
 
-A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
+A frame is copied once into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
 :data:`MAX_LEASES` frames, or whose socket is full, is skipped. Once it releases a frame, it gets the newest frame.
 There is always a free slot, because each viewer can hold only a limited number of slots.
 """
@@ -131,7 +131,7 @@ class Camera:
         """Return a slot for a frame. The writer holds the slot until :meth:`offer`. ``OSError``: out of memory."""
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
-            # The size of compressed frames varies. When one outgrows its slots, new slots therefore get spare room.
+            # The size of compressed frames varies. When one outgrows its slots, new slots get some spare room.
             grows = geometry == self._geometry
             self.retire()
             self._geometry = geometry
@@ -224,7 +224,7 @@ class Camera:
 
 
 class FrameExchange:
-    """Manages all cameras of a server. Thread-safe. Frames are copied while its lock is not held."""
+    """Manages all cameras of a server. Thread-safe. Frames are copied while the lock of the exchange is not held."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

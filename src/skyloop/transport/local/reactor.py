@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 class Source:
-    """A socket that a reactor waits for: either a server's listener (``sock``) or one of its connections."""
+    """A socket that a reactor waits for: a server's listener (``sock``) or one of its connections."""
 
     def __init__(
         self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None

@@ -161,7 +161,7 @@ class ServerConnection:
         self._socket.sendmsg((packet,), (rights,), SEND_FLAGS)
 
     def hang_up(self, reason: str) -> None:
-        """End the connection with a reason. Any thread. To the receiving thread, this is like any other end."""
+        """End the connection with a reason. Any thread. The receiving thread treats it like any other end."""
         if not self.ending:
             self.reason = self.reason or reason
             self.ending = True
