@@ -102,7 +102,7 @@ class Host:
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
-            # The link may be removed as soon as it runs: ``_forget`` stops the ticks of a proxy that has ended.
+            # The vehicle may already have been removed again. ``_forget`` stops the ticks of a proxy that has ended.
             if (proxy := vehicle.proxy) is not None and vehicle.runs:
                 self._ticker.add(proxy)
         return vehicle

@@ -46,7 +46,7 @@ class ServerConnection:
         self.id = connection
         self.admission = admission
         self.joined_s = joined_s  #: time at which the application asked to join
-        self.commands = PacketBacklog(MAX_WAITING)  #: commands that wait for the handler; the server guards this list
+        self.commands = PacketBacklog(MAX_WAITING)  #: commands that wait for the handler; the server guards them
         self.announced = False  #: the handler was told about the application
         self.confirmed = False  #: its token has been seen, so Zenoh will report when it ends
         self.ended = False  #: further packets from the application are ignored
@@ -56,7 +56,7 @@ class ServerConnection:
         self.receiver = Receiver()  #: packets from the application
         self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to the application
         self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
-        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged frame
+        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged packet
         self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet matters
         self.left = False  #: the application has unsubscribed for good from every topic
 

@@ -4,7 +4,7 @@ The number of packets in flight is limited. Time is passed as an argument, and s
 
 Sending must never block, so Zenoh drops what a congested path can't carry, either here or at a router. Zenoh also drops
 packets that reach a node before the subscription does. Each numbered packet is therefore kept and resent until the
-other end acknowledges it. Only a few frames are in flight at once, to avoid congesting a slow path.
+other end acknowledges it. Only a few packets are in flight at once, to avoid congesting a slow path.
 """
 
 from __future__ import annotations

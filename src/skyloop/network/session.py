@@ -31,7 +31,7 @@ _BORROWED_S: Final = 0.001  # … and the pause between them
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
 _ATTEMPTS: Final = 5  # number of attempts to get a free port before another process takes it
-Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: The Zenoh priorities that are used, highest first.
+Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: the Zenoh priorities in use, highest first
 
 
 class Session:

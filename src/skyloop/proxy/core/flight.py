@@ -254,7 +254,7 @@ class Flight:
         self._start_descent(now_ns)
 
     def let_go(self, action_name: str) -> None:
-        """Record that the vehicle is now executing an action by itself."""
+        """Record that the vehicle itself is now executing an action."""
         self._steered = False
         if action_name == "emergency_stop":
             self._state = FlightState.EMERGENCY

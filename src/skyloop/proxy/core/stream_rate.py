@@ -22,10 +22,10 @@ LEAST_KBIT_S: Final = 60
 #: The initial rate. Isolated late frames do not reduce the rate further: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
-STANDING_S: Final = 0.25  #: the shortest wait within this time counts as a standing queue
-LONG_WAIT_S: Final = 0.06  #: the rate falls if the wait in a standing queue is longer than this
+STANDING_S: Final = 0.25  #: the shortest wait within this time is the wait in the standing queue
+LONG_WAIT_S: Final = 0.06  #: the rate falls if the wait in the standing queue is longer than this
 FALL: Final = 0.85  #: fraction of the delivery rate to which the rate then falls
-GOOD_WAIT_S: Final = 0.03  #: the rate grows if the wait in a standing queue is shorter than this
+GOOD_WAIT_S: Final = 0.03  #: the rate grows if the wait in the standing queue is shorter than this
 LATE_S: Final = 0.1  #: a single frame that has waited this long is late
 LATE_FALL: Final = 0.7  #: factor for the rate after a late frame
 LATE_EVERY_S: Final = 0.15  #: all late frames within this time reduce the rate only once
