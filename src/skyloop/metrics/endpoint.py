@@ -134,7 +134,7 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: maximum number of open scrapes; one more closes the one that has waited longest
+MAX_SCRAPES: Final = 8  #: maximum number of scrapes; one more closes the connection waiting longest for its request
 ANSWER_S: Final = 1.0  #: before this time, a scrape is not closed to make room for a new connection
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop

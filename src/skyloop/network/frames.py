@@ -52,7 +52,7 @@ class Reader:
 
     def __init__(self) -> None:
         self._on_way: deque[tuple[int, int]] = deque()  # number of each frame, and the time when it was sent
-        self.due = False  #: the newest frame should be sent to this viewer
+        self.due = False  #: the newest frame should be sent to this connection
         self.waits = False  #: the connection has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
@@ -259,7 +259,7 @@ class FramePublisher:
                     now_ns = self._clock()
                     for key in due:
                         variant.readers[key].sent(picture.number, now_ns)
-                    variants[topic] = variants.pop(topic)  # next time, the other connections come first
+                    variants[topic] = variants.pop(topic)  # next time, the other variants come first
                     return variant, picture, None if len(due) == len(variant.readers) else due
                 self._changed.wait()
             self._threads.pop(camera, None)

@@ -111,7 +111,7 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # if this event is lost, no other event reports the change
+                self._missed = 0  # if this event is lost, no other event reports the loss
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
         """Number events and publish them. The caller holds the lock."""
