@@ -49,7 +49,7 @@ class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
     run: str  #: random identity of the proxy's run
     what: str  #: ``begin``, ``granted``, ``ended``, ``takeoff``, ``landed``, ``emergency`` or ``end``
     who: str = ""  #: name of the application
-    identity: str = ""  #: what the transport knows about the process: process and user, or the name in its certificate
+    identity: str = ""  #: what the transport knows about it: process and user, or the name in its certificate
     lease: int = 0
     priority: int = 0
     how: str = ""  #: why a lease or the run ended; for ``begin``, the vehicle's address

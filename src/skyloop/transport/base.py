@@ -174,7 +174,7 @@ class ClientHandler(Protocol):
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, whichever end closed it and why. Called once. It is the last callback."""
+        """Handle the end of the connection, whichever end closed it. Called once, as the last callback."""
 
 
 class TransportClient(ABC):
@@ -182,7 +182,7 @@ class TransportClient(ABC):
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the proxy. Return whether the packet was handed over to Zenoh. Any thread."""
+        """Send a packet to the proxy. Return whether the packet was handed over. Any thread."""
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:

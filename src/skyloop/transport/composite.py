@@ -14,7 +14,7 @@ from skyloop.transport.priority import PriorityLock, is_command
 class CompositeServer(TransportServer):
     """One transport server that combines several, nearest first. The server assigns its own numbers to their peers.
 
-    The handler gets one call at a time, as the contract requires. Ends with a command go first, then by arrival.
+    The handler gets one call at a time, as the contract requires: commands first, all others in order of arrival.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
@@ -28,7 +28,7 @@ class CompositeServer(TransportServer):
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start accepting connections at all ends. If one end's ``start`` raises, no end stays started."""
+        """Start accepting connections at all ends. If one end's ``start`` raises, stop the ends that have started."""
         started: list[TransportServer] = []
         try:
             for end in self._ends:
@@ -47,7 +47,7 @@ class CompositeServer(TransportServer):
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
             thread.start()
-        if not self.lock.held:  # otherwise, ending it would mean waiting for the lock that this thread holds
+        if not self.lock.held:  # otherwise an end would wait for the lock that this thread holds
             for thread in threads:
                 thread.join()
 
