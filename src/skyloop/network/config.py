@@ -1,6 +1,6 @@
 """Read network settings from arguments and the environment, and create Zenoh's configuration from them.
 
-A pure function, except that it reads the environment and finds a free port.
+Pure, except that it reads the environment and finds a free port.
 """
 
 from __future__ import annotations

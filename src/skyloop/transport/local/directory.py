@@ -164,7 +164,7 @@ class Directory:
             path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
         descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
         try:
-            if path is not self.path and os.geteuid() == 0:  # root may have created the directory for another user
+            if path is not self.path and os.geteuid() == 0:  # root may have created it in another user's directory
                 os.fchown(descriptor, here.st_uid, -1)
             _lock(descriptor, path, timeout_s)
             yield
