@@ -1,1 +1,1 @@
-"""Many vehicles in one process: their proxies share threads, and are added and removed while others fly."""
+"""Many vehicles in one process. Their proxies share threads, and are added and removed while others fly."""

@@ -1,4 +1,4 @@
-"""Read a host's vehicle file, ``fleet.toml``, as described in ``docs/host.md``. Pure except for reading the file."""
+"""Read a host's vehicle file, ``fleet.toml``, as described in ``docs/host.md``. Pure except that it reads the file."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
 HOST: Final = "host"  #: default name of a host
-#: Schemes whose addresses each create a new vehicle, so that two vehicles may have the same address.
+#: Address schemes for which each address creates a new vehicle, so that two vehicles may have the same address.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")
 
 
 class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """``limits``: the proxy parameters with the same names."""
+    """``limits``: the values of the proxy parameters with the same names."""
 
     tilt: float | None = None
     climb: float | None = None
@@ -41,7 +41,7 @@ class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_f
     listen: list[str] | None = None
     multicast: bool | None = None  #: whether multicast discovery is used if ``network`` includes it
     keys: Text | None = None  #: an identity's folder
-    group: Text | None = None  #: users who may connect in addition to this one
+    group: Text | None = None  #: users who may connect in addition to the current user
     limits: FlightLimits | None = None
     zones: list[str] | None = None
     parameters: dict[str, Any] | None = None  #: the proxy's parameters, by name
@@ -50,7 +50,7 @@ class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_f
 
 
 class Vehicle(Defaults, frozen=True, omit_defaults=True, forbid_unknown_fields=True, kw_only=True):
-    """One vehicle in the file: ``[[vehicle]]``."""
+    """One vehicle in the file (``[[vehicle]]``)."""
 
     name: Text
     address: Text
@@ -78,12 +78,12 @@ class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def encode_handed(value: object) -> bytes:
-    """Encode settings, alone or nested, for the process that serves the vehicle, including any secrets in addresses."""
+    """Encode settings, alone or nested, for the process that serves the vehicle. Includes the secrets in addresses."""
     return msgspec.json.encode(value, enc_hook=_revealed)
 
 
 def decoder_of_handed(kind: Any) -> msgspec.json.Decoder[Any]:
-    """Return a decoder for values of this type encoded by :func:`encode_handed`."""
+    """Return a decoder for values of this type that :func:`encode_handed` encoded."""
     return msgspec.json.Decoder(kind, dec_hook=lambda _, text: parse_uri(text))
 
 
@@ -98,11 +98,11 @@ class Fleet(msgspec.Struct, frozen=True):
 
     name: str
     vehicles: tuple[VehicleSettings, ...]
-    defaults: Defaults  #: the defaults for vehicles added by address
+    defaults: Defaults  #: the default settings of vehicles added by address
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Read a host's vehicle file. Key folders in the file are relative to its own folder."""
+    """Read a host's vehicle file. Relative paths of key folders in the file start from the file's own folder."""
     path = expand(path)
     try:
         with path.open("rb") as file:
@@ -150,7 +150,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
 
 
 def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
-    """Return a vehicle's settings with defaults filled in; ``own`` contains the file's values at ``place``."""
+    """Return a vehicle's settings with defaults filled in. ``own`` contains the file's values at ``place``."""
     _checked(place, "name", lambda: check_name(vehicle.name))
     uri = _checked(place, "address", lambda: parse_uri(vehicle.address))
     _checked(place, "address", lambda: driver_class(uri.scheme))
@@ -205,7 +205,7 @@ def _check_preset(place: Place, name: str, presets: dict[str, Value]) -> None:
 
 
 def _checked(place: Place, key: str, check: Any) -> Any:
-    """Return the result of ``check``; convert its exceptions to errors about the file."""
+    """Return the result of ``check``, and convert its exceptions to errors about the file."""
     try:
         return check()
     except FileFormatError:

@@ -1,4 +1,4 @@
-"""The host, which runs any number of vehicles in one process; each can fail, join or leave without affecting others."""
+"""The host. It runs any number of vehicles in one process. Each can fail, join or leave without affecting others."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Host:
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they joined
         self.known: dict[str, VehicleSettings] = {}  #: vehicles that can be started by name alone
         self._lock = threading.Lock()  # guards the vehicles and the loops
-        self._reactor = Reactor()  # the reactor for vehicles that are added
+        self._reactor = Reactor()  # the reactor for vehicles that are added later
         self._ticker = Ticker(self._on_failing)
         self._links = LinkThread()
         self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
@@ -72,7 +72,7 @@ class Host:
         self._closing = False
 
     def proxies(self) -> list[Proxy]:
-        """Return the proxies currently serving in this process. Any thread."""
+        """Return the proxies that this process is currently serving. Any thread."""
         return [proxy for vehicle in list(self.vehicles.values()) if (proxy := vehicle.proxy) is not None]
 
     # Joining and leaving -----------------------------------------------------------------------------------------
@@ -102,7 +102,7 @@ class Host:
                 raise
             raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
         with self._lock:
-            # It may have been removed as soon as it ran; _forget stops the ticks of a proxy that has ended.
+            # The vehicle may already have been removed again. ``_forget`` stops the ticks of a proxy that has ended.
             if (proxy := vehicle.proxy) is not None and vehicle.runs:
                 self._ticker.add(proxy)
         return vehicle
@@ -120,7 +120,7 @@ class Host:
             self._links.add(link, vehicle)
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
-        """Serve several vehicles, some concurrently; return by name why vehicles failed."""
+        """Serve several vehicles, some of them at the same time. Return the reasons why vehicles failed, by name."""
         problems: dict[str, str] = {}
 
         def add(settings: VehicleSettings) -> None:
@@ -134,10 +134,10 @@ class Host:
         return problems
 
     def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
-        """Land a vehicle, end its proxy and forget it; return its last status.
+        """Land a vehicle, end its proxy and remove it; return its last status.
 
-        Raises :class:`RefusedError` and does not remove the vehicle if it flies under a lease (code ``flown``) and
-        ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
+        Raises :class:`RefusedError`, without removing the vehicle, if the vehicle flies under a lease (code ``flown``)
+        and ``land`` is not set, or if it has not landed within ``timeout_s`` [s] (``flying``).
         """
         vehicle = self.vehicles.get(name)
         if vehicle is None:
@@ -178,7 +178,7 @@ class Host:
         return ended
 
     def _forget(self, proxy: Proxy) -> None:
-        """Stop ticking a proxy that has ended, and close loops that only it used."""
+        """Stop ticking a proxy that has ended, and close the loops that only this proxy used."""
         with self._lock:
             for loop in self._loops:
                 if isinstance(loop, Ticker):
@@ -189,7 +189,7 @@ class Host:
             loop.close()
 
     def _is_shared(self, loop: SharedLoop) -> bool:
-        """Return whether new vehicles may join this loop. If not, it was left to a vehicle whose driver blocks it."""
+        """Return whether new vehicles may join this loop. If not, it belongs to a vehicle whose driver blocks it."""
         return loop in (self._reactor, self._ticker, self._links)
 
     def status(self) -> list[VehicleStatus]:
@@ -215,8 +215,8 @@ class Host:
     ) -> None:
         """End all flights (landing for up to ``within_s`` [s]), proxies, and threads that are not stuck. Idempotent.
 
-        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings. So
-        does Ctrl-C if nothing else handles it; ``KeyboardInterrupt`` is then raised at the end.
+        ``reason`` is shown to users. ``hurry`` is polled several times a second; True ends the wait for landings.
+        Ctrl-C does the same if nothing else handles it. ``KeyboardInterrupt`` is then raised at the end.
         """
         with self._lock:
             self._closing = True
@@ -230,7 +230,7 @@ class Host:
                 if (proxy := vehicle.proxy) is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
-            # Use one thread per vehicle: a driver that hangs must not keep another vehicle in the air.
+            # Use one thread per vehicle, because a driver that hangs must not keep another vehicle in the air.
             at_once(
                 {vehicle: partial(end, vehicle) for vehicle in vehicles},
                 tell=tell,
@@ -245,14 +245,14 @@ class Host:
     # Drivers that hang or fail -----------------------------------------------------------------------------------
 
     def _of(self, member: Any) -> SharedVehicle | None:
-        """Return the given vehicle, or the vehicle that owns the given transport server or proxy."""
+        """Return the given vehicle, or the vehicle that the given transport server or proxy belongs to."""
         for vehicle in list(self.vehicles.values()):
             if isinstance(vehicle, SharedVehicle) and member in (vehicle, vehicle.server, vehicle.proxy):
                 return vehicle
         return None
 
     def _on_stall(self, loop: SharedLoop, member: Any) -> None:
-        """Move all other vehicles from a stalled loop to a new one."""
+        """Move all other vehicles from a stalled loop to a new loop."""
         with self._lock:
             new: SharedLoop
             if not self._is_shared(loop):
@@ -274,7 +274,7 @@ class Host:
         """Give up a vehicle whose driver hangs."""
         with self._lock:
             self._loops.remove(loop)
-        loop.close()  # in case it ever returns
+        loop.close()  # in case the thread ever returns
         if (vehicle := self._of(member)) is not None:
             self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
 
@@ -296,7 +296,7 @@ class Host:
 
 
 def check_known(host: Host, name: str) -> VehicleSettings:
-    """Return the settings of a vehicle from the host's file that is not running."""
+    """Return the settings of a vehicle in the host's file that is not running."""
     settings = host.known.get(name)
     if settings is None:
         raise UnknownNameError("vehicle of this host's file", name, host.known)

@@ -1,8 +1,8 @@
-"""A vehicle whose proxy runs in a separate process, which is restarted when it dies.
+"""A vehicle whose proxy runs in a separate process. The process is restarted when it dies.
 
-The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. It ends with its
-host, immediately and without landing, just like a proxy within the host's process. Each line of its standard output
-is a status for the host in JSON.
+The process runs ``python -m skyloop.host.own_process NAME`` and receives its settings when it starts. The process ends
+with its host, immediately and without a landing, just like a proxy inside the host's process. Each line of its standard
+output is a status for the host, in JSON.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
 STARTS_WITHIN_S: Final = 20.0  #: time limit for the first report
-FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; doubles each time the process dies
-LONGEST_PAUSE_S: Final = 30.0  #: maximum length of that pause
-#: Checks without a report, at four per second, after which the process is considered hung and killed. Checks are
-#: counted rather than seconds, so that a process is not considered hung after its computer was suspended.
+FIRST_PAUSE_S: Final = 0.5  #: pause before the first restart; it doubles each time the process dies
+LONGEST_PAUSE_S: Final = 30.0  #: maximum length of the pause before a restart
+#: Number of checks without a report, at four per second, after which the process is considered hung and killed. Checks
+#: are counted rather than seconds, because the computer may have been suspended in the meantime.
 SILENT_CHECKS: Final = 40
-STARTING_CHECKS: Final = 80  #: the same limit before the process has sent its first report
-STEADY_S: Final = 60.0  #: if it ran for this long before it died, a process is restarted after the shortest pause
+STARTING_CHECKS: Final = 80  #: the same limit for the time before the process has sent its first report
+STEADY_S: Final = 60.0  #: a process that ran for this long before it died is restarted after the shortest pause
 _POLL_S: Final = 0.05
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
@@ -43,15 +43,15 @@ STATUS_EVERY_S: Final = 0.25  #: interval between reports
 
 
 def pause_s(deaths: int) -> float:
-    """Return the pause before restarting a process that has died this many times in succession [s]."""
+    """Return the pause before restarting a process that has died this many times in a row [s]."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** min(deaths - 1, 20)))
 
 
 class OwnProcessVehicle(HostedVehicle):
-    """A vehicle with ``process = "own"``, whose driver can harm only its own process.
+    """A vehicle with ``process = "own"``. Its driver can only harm its own process.
 
     ``announce`` is called with a line of text for users when the process dies and when it is restarted. ``command``
-    starts the process; the vehicle's name is appended, and its settings are passed separately.
+    starts the process. The vehicle's name is appended to the command, and the vehicle's settings are passed separately.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class OwnProcessVehicle(HostedVehicle):
     ) -> None:
         super().__init__(settings)
         self._announce = announce
-        self._changed = threading.Condition()  # guards all of the following
-        self._reported: VehicleStatus | None = None  # status reported by the current process
-        self._silent_checks = 0  # number of checks since it last sent a report
-        self._deaths = 0  # number of deaths in succession
+        self._changed = threading.Condition()  # guards all of the following attributes
+        self._reported: VehicleStatus | None = None  # the status that the current process reported
+        self._silent_checks = 0  # number of checks since the process last sent a report
+        self._deaths = 0  # number of deaths in a row
         self._runner = RestartingChild(
             [*command, settings.name],
             handed=encode_handed(settings).decode(),
@@ -94,7 +94,7 @@ class OwnProcessVehicle(HostedVehicle):
         for line in child.stdout:
             try:
                 status = _decoder.decode(line)
-            except msgspec.DecodeError:  # a line printed by a driver
+            except msgspec.DecodeError:  # a line that a driver printed
                 _log.info("%s: %s", self.settings.name, line.decode(errors="replace").rstrip())
                 continue
             with self._changed:
@@ -110,7 +110,7 @@ class OwnProcessVehicle(HostedVehicle):
                 self._announce(f"vehicle of {self.settings.name}: running again, process {child.pid}")
 
     def _is_silent(self) -> bool:
-        """Return whether the process has stopped sending reports without having been asked to end."""
+        """Return whether the process has stopped sending reports although no one asked it to end."""
         with self._changed:
             self._silent_checks += 1
             most = STARTING_CHECKS if self._reported is None else SILENT_CHECKS
@@ -154,7 +154,7 @@ class OwnProcessVehicle(HostedVehicle):
         *,
         unless_flying: bool = False,
     ) -> bool:
-        """Ask the process to land the vehicle and end. It is not restarted."""
+        """Ask the process to land the vehicle and end. The vehicle is not restarted."""
         asked = self._runner.stopping
         child = self._runner.request_stop()
         if child is not None and child.code is None:
@@ -174,7 +174,7 @@ class OwnProcessVehicle(HostedVehicle):
 
 
 def serve(settings: VehicleSettings) -> None:
-    """Serve one vehicle until SIGTERM, which lands it, or until the host ends. Must run on the main thread."""
+    """Serve one vehicle until SIGTERM (which lands it first) or until the host ends. Must run on the main thread."""
     network = network_of(settings)
     driver = make_driver(settings.address)
     end: TransportServer = LocalServer(settings.name, group=settings.group)

@@ -1,7 +1,7 @@
-"""The host process run by ``skyloop host fleet.toml``, and its control socket: ``add``, ``remove`` and ``status``.
+"""The host process that ``skyloop host fleet.toml`` runs, and its control socket: ``add``, ``remove`` and ``status``.
 
-Each connection carries one JSON request and one answer, split into packets. The socket ``NAME.host`` is next to the
-proxies' sockets and accessible to the same users: the host's own, the superuser, and members of its group.
+Each connection carries one request and one answer in JSON, split into packets. The socket ``NAME.host`` is next to the
+proxies' sockets. The same users can access it: the host's own user, the superuser, and members of the host's group.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
 
-_POLL_S: Final = 0.2  # interval between checks for signals and changes
+_POLL_S: Final = 0.2  # interval between checks for signals and updates
 MAX_REQUEST: Final = 1 << 22  #: maximum size in bytes, sent in packets of ``_CHUNK``
 MAX_PACKET: Final = 1 << 16  #: maximum size in bytes
 MAX_ANSWER: Final = 1 << 22  #: maximum size in bytes
 ANSWERS_WITHIN_S: Final = 60.0  #: time for an answer, including the landing before a removal
 _CHUNK: Final = 1 << 15  # size of a packet in bytes
-_AGAIN_S: Final = 0.1  # pause after a failed accept
+_AGAIN_S: Final = 0.1  # pause after accepting a connection has failed
 _SLOW_S: Final = 2.0  # time for the other end to receive or send a packet
 _log = logging.getLogger(__name__)
 
@@ -56,9 +56,9 @@ def serve(
     """Serve all vehicles of a fleet that start automatically. Blocks. Must run on the main thread.
 
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
-    …`` after all have been tried. SIGINT or SIGTERM ends it, landing all flying vehicles first for up to
-    ``land_within_s`` [s]; a second signal ends the wait. Members of ``group`` may also add and remove vehicles.
-    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced.
+    …`` after all have been tried. SIGINT or SIGTERM ends it. The host first lands all flying vehicles, for up to
+    ``land_within_s`` [s]. A second signal ends this wait. Members of ``group`` may also add and remove vehicles.
+    ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus. The address is printed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -81,7 +81,7 @@ def serve(
         polls = _key_changes(fleet)
         gc.collect()
         gc.freeze()  # skip long-lived objects: collecting them takes 20 ms
-        # Poll, because the kernel may deliver a signal to another thread, and that does not wake this one.
+        # Poll, because the kernel may deliver a signal to another thread, which does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             lines.update(list(host.vehicles.values()))
             for poll in polls:
@@ -92,7 +92,7 @@ def serve(
 
 
 class Answering:
-    """Answers requests at a host's control socket; the defaults are for vehicles given only by address."""
+    """Answers requests at a host's control socket. The defaults are for vehicles that are specified only by address."""
 
     def __init__(self, host: Host, defaults: Defaults) -> None:
         self._host = host
@@ -123,7 +123,7 @@ class Answering:
 
 
 class _Lines:
-    """Prints whether a vehicle is ready, or why it waits, whenever that changes."""
+    """Prints whether a vehicle is ready, or why it is not, whenever this changes."""
 
     def __init__(self) -> None:
         self._lines: dict[HostedVehicle, LinkLines] = {}
@@ -150,10 +150,10 @@ def _where(vehicle: HostedVehicle, status: VehicleStatus) -> str:
 
 
 def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
-    """Return a source of updates about the keys for each of the fleet's key folders."""
+    """Return one source of updates about the keys for each of the fleet's key folders."""
     polls: dict[str | None, Callable[[], list[str]]] = {}
     for vehicle in fleet.vehicles:
-        with suppress(UsageError, ImportError):  # a folder whose vehicle could not be served
+        with suppress(UsageError, ImportError):  # a vehicle whose key folder can't be used is not served
             settings = network_of(vehicle)
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
@@ -162,7 +162,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
 
 def announce(line: str) -> None:
     """Write a line to standard output."""
-    with suppress(OSError):  # the reader is gone; continue serving
+    with suppress(OSError):  # no one reads the output; continue serving
         print(line, flush=True)
 
 
@@ -171,13 +171,13 @@ class Status(msgspec.Struct, frozen=True, tag="status"):
 
 
 class Add(msgspec.Struct, frozen=True, tag="add"):
-    """Request to serve more vehicles; those already running are left unchanged."""
+    """Request to serve more vehicles. Vehicles that are already running are left unchanged."""
 
     vehicles: tuple[VehicleSettings, ...]
 
 
 class AddNamed(msgspec.Struct, frozen=True, tag="add_named"):
-    """Request to serve one more vehicle, either one from the host's file by name, or any other by address."""
+    """Request to serve one more vehicle: either a vehicle in the host's file, by name, or any other, by address."""
 
     name: str
     address: str | None = None
@@ -195,12 +195,12 @@ Request = Status | Add | AddNamed | Remove
 
 
 class Answer(msgspec.Struct, frozen=True):
-    """The host's answer."""
+    """The answer from a host."""
 
     vehicles: tuple[VehicleStatus, ...] = ()  #: all vehicles, or those in the request
     problems: dict[str, str] = {}  #: why vehicles could not be added, by name
-    error: str = ""  #: why nothing was done
-    kind: str = ""  #: class name of that error
+    error: str = ""  #: the reason why nothing was done
+    kind: str = ""  #: class name of the error
     code: str = ""
 
 
@@ -214,7 +214,7 @@ _ERRORS: Final[dict[str, type[SkyloopError]]] = {
 
 
 class ControlServer:
-    """Accepts requests from this user and the members of a group, from :meth:`start` to :meth:`stop`."""
+    """Between :meth:`start` and :meth:`stop`, accepts requests from this user and from the members of a group."""
 
     def __init__(self, name: str, answering: Responder, *, group: str | None = None) -> None:
         self._name = name
@@ -268,7 +268,7 @@ class ControlServer:
         sock.hang_up()
 
     def _answer(self, sock: Socket) -> Answer | None:
-        """Return the answer to a request, or None if there was no request because a client only checked for a host."""
+        """Return the answer to a request; None if a client only checked whether a host exists."""
         if not may_connect(sock, self._directory.gid):
             return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
@@ -278,7 +278,7 @@ class ControlServer:
                 break
             with suppress(msgspec.DecodeError, RecursionError):
                 _requests.decode(received)
-                break  # the request filled its last packet exactly
+                break  # the request exactly filled the last packet
         if not received:
             return None
         if len(received) > MAX_REQUEST:
@@ -299,7 +299,7 @@ class ControlServer:
 
 
 def _send(sock: Socket, text: bytes) -> None:
-    """Send a request or an answer in as many packets as needed."""
+    """Send a request or an answer, split into as many packets as needed."""
     for first in range(0, len(text), _CHUNK):
         sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
 
@@ -324,7 +324,7 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
 
 
 def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
-    """Send a request to a host; return its answer or raise its error, :class:`LinkError` or :class:`NoAnswerError`."""
+    """Send a request to a host. Return or raise its answer, or raise :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:
         directory.check()
@@ -334,7 +334,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
     received = bytearray()
     try:
-        with suppress(BrokenPipeError):  # a refused caller gets its answer before it has sent its whole request
+        with suppress(BrokenPipeError):  # a caller that is refused gets its answer before it has sent its whole request
             _send(sock, encode_handed(request))
         while (packet := sock.recv(_CHUNK)) and len(received) < MAX_ANSWER:
             received += packet

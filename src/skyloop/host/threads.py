@@ -1,4 +1,4 @@
-"""Threads shared by many vehicles: ticks, links, requests; and a watchdog that detects loops that hang."""
+"""Threads shared by many vehicles (for ticks, links and requests), and a watchdog that detects loops that hang."""
 
 from __future__ import annotations
 
@@ -20,39 +20,39 @@ from skyloop.drivers.vehicle_link import PAUSE_S
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
-#: Failed ticks in succession (half a second) after which a proxy counts as failed: it no longer has a failsafe.
+#: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Number of rounds after which a proxy does everything again, ten times a second.
+#: Number of rounds after which a proxy does everything again, which is ten times a second.
 WHOLE_ROUNDS: Final = 5
 _log = logging.getLogger(__name__)
 
-#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing; must return immediately.
+#: Called on the ticker's thread with the last error and the proxy whose ticks keep failing. It must return immediately.
 OnFailing = Callable[[Proxy, BaseException], None]
-MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before others have to wait
-IDLE_THREADS: Final = 2  #: number of threads kept for bursts of requests
-_IDLE_S: Final = 5.0  #: a spare thread without a job ends after this time
+MAX_THREADS: Final = 64  #: number of drivers that may hang in a request before other drivers have to wait
+IDLE_THREADS: Final = 2  #: number of threads kept ready for bursts of requests
+_IDLE_S: Final = 5.0  #: a spare thread ends after this time without a job
 
 Job = Callable[[], None]
 _LONGEST_WAIT_NS: Final = 1_000_000_000  #: maximum time to wait in the selector
-_MOST_STALE: Final = 4  #: number of queue entries per link at which stale ones are removed
+_MOST_STALE: Final = 4  #: maximum number of queue entries per link; beyond it, stale entries are removed
 CHECK_S: Final = 0.05  #: interval between checks
 STALL_CHECKS: Final = 5  #: 0.25 s: gives other vehicles a new thread before their pilots' silence makes them hover
-HANG_CHECKS: Final = 40  #: 2 s: the vehicle is dropped
+HANG_CHECKS: Final = 40  #: 2 s: the vehicle is given up
 
 
 class Ticker:
-    """Ticks proxies on one thread, from construction to :meth:`close`. A failed tick does not affect other proxies.
+    """Ticks proxies on one thread, from construction until :meth:`close`. A failed tick does not affect other proxies.
 
-    Like a :class:`skyloop.transport.local.reactor.Reactor`, it shows whose code is running and can be split.
-    ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in succession.
+    Like a :class:`skyloop.transport.local.reactor.Reactor`, it records whose code is running and can be split.
+    ``on_failing``: called for a proxy after :data:`MAX_FAILURES` failed ticks in a row.
     """
 
     def __init__(self, on_failing: OnFailing, proxies: Iterable[Proxy] = ()) -> None:
         self.inside: Proxy | None = None  #: the proxy currently being ticked
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
-        self._failures = dict.fromkeys(proxies, 0)  # number of failures in succession, by proxy
-        self._lock = threading.Lock()  # guards what is known about whose code is running
+        self._failures = dict.fromkeys(proxies, 0)  # number of failures in a row, by proxy
+        self._lock = threading.Lock()  # guards the record of whose code is running
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -63,7 +63,7 @@ class Ticker:
             self._failures[proxy] = 0
 
     def remove(self, proxy: Proxy) -> bool:
-        """Stop ticking a proxy; return whether it was ticked here. A tick in progress continues. Any thread."""
+        """Stop ticking a proxy; return whether this ticker was ticking it. A tick in progress continues. Any thread."""
         with self._lock:
             return self._failures.pop(proxy, None) is not None
 
@@ -126,11 +126,11 @@ class Ticker:
 
 
 class RequestWorkers:
-    """A pool of daemon threads for the proxies' job queues: a job that hangs delays only its own queue."""
+    """A pool of daemon threads for the proxies' job queues. A job that hangs delays only its own queue."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._ready: deque[PooledJobQueue] = deque()  # queues with a job that has not been started
+        self._ready: deque[PooledJobQueue] = deque()  # queues that contain a job that has not been started
         self._idle = 0
         self._threads = 0
         self._closed = False
@@ -183,7 +183,7 @@ class PooledJobQueue:
         self._stopped = False
 
     def start(self) -> None:
-        """Do nothing: the pool has its threads."""
+        """Do nothing, because the pool has its own threads."""
 
     def put(self, job: Job) -> None:
         """Queue a job. Any thread."""
@@ -197,7 +197,7 @@ class PooledJobQueue:
         self._workers.schedule(self)
 
     def stop(self, timeout_s: float) -> None:
-        """Wait up to this long [s] for the job in progress; drop the others."""
+        """Wait up to this long [s] for the job in progress. Drop all other jobs."""
         with self._changed:
             self._stopped = True
             self._jobs.clear()
@@ -219,11 +219,11 @@ class PooledJobQueue:
 
 
 class SharedLoop(Protocol):
-    """A thread that runs many vehicles' code: a ``Reactor`` or a ``Ticker``."""
+    """A thread that runs the code of many vehicles: a ``Reactor`` or a ``Ticker``."""
 
     @property
     def inside(self) -> Any:
-        """The object whose code is currently running, or None."""
+        """The object whose code is currently running; None if no code is."""
 
     @property
     def entries(self) -> int:
@@ -240,9 +240,9 @@ class SharedLoop(Protocol):
 class Watchdog:
     """Checks shared loops 20 times a second on a separate thread, from :meth:`start` to :meth:`close`.
 
-    It counts its own checks rather than time, so that a loop on a suspended or overloaded machine is not considered
-    hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for each call
-    that does not return, and ``on_hang`` if the call still has not returned.
+    The watchdog counts its own checks rather than time. A loop on a suspended or overloaded machine is therefore not
+    considered hung merely because time has passed. ``on_stall`` is called with a loop and its stuck member, once for
+    each call that does not return. ``on_hang`` is called if that call still does not return.
     """
 
     def __init__(
@@ -293,15 +293,15 @@ class Watchdog:
 
 
 class LinkThread:
-    """Serves links on one thread when they are readable or due, from construction to :meth:`close`.
+    """Serves links on one thread when they are readable or due, from construction until :meth:`close`.
 
-    One thread for all, because with one thread each, most of the time would be spent switching threads. Commands bypass
+    One thread for all links: with one thread each, most of the time would be spent switching threads. Commands bypass
     it: they are sent on the thread that receives them. Like a :class:`skyloop.transport.local.reactor.Reactor`, it
-    shows whose code is running and can be split. ``links``: the initial ones, each with the vehicle it belongs to.
+    records whose code is running and can be split. ``links``: the initial links, each with the vehicle it belongs to.
     """
 
     def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
-        self.inside: Any = None  #: the vehicle whose link is currently being served
+        self.inside: Any = None  #: the vehicle whose link is currently being polled
         self.entries = 0  #: number of times :attr:`inside` was set
         self._selector = selectors.DefaultSelector()
         self._waker, self._awake = socket.socketpair()
@@ -334,7 +334,7 @@ class LinkThread:
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:
-        """Leave this thread to one vehicle's links; return a new one for all other links. Any thread."""
+        """Leave this thread to one vehicle's links, and return a new thread for all other links. Any thread."""
         with self._lock:
             others = {link: vehicle for link, vehicle in self._members.items() if vehicle is not stuck}
             for link in others:
@@ -342,7 +342,7 @@ class LinkThread:
         return LinkThread(others)
 
     def close(self) -> None:
-        """End the thread, unless it is stuck, and any links that remain. Idempotent."""
+        """End the thread unless it is stuck, and end the links that remain. Idempotent."""
         self._closing = True
         self._wake()
         if threading.current_thread() is not self._thread and self.inside is None:
@@ -369,18 +369,18 @@ class LinkThread:
             heapify(self._queue)
 
     def _next_ns(self) -> int | None:
-        """Return when the next link is due, or None if there is none. The caller holds the lock."""
+        """Return the time when the next link is due; None if no link is. The caller holds the lock."""
         queue = self._queue
         while queue and self._due_ns.get(queue[0][2]) != queue[0][0]:
             heappop(queue)
         return queue[0][0] if queue else None
 
     def _due(self, now_ns: int) -> set[ServedLink]:
-        """Return the links that are due. The caller holds the lock."""
+        """Return the links that are due for polling. The caller holds the lock."""
         due: set[ServedLink] = set()
         while (next_ns := self._next_ns()) is not None and next_ns <= now_ns:
             link = heappop(self._queue)[2]
-            del self._due_ns[link]  # absent until it has been served
+            del self._due_ns[link]  # absent until its link has been served
             due.add(link)
         return due
 
@@ -404,7 +404,7 @@ class LinkThread:
             self.inside = None
         with self._lock:
             left = list(self._members)
-        for link in left:  # links of a vehicle that was dropped
+        for link in left:  # the links of a vehicle that was dropped
             link.end()
         self._selector.close()
         self._awake.close()
@@ -414,10 +414,10 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread has taken over since then
+                return  # another thread took over the link in the meantime
             if link in self._paused:
                 self._paused.remove(link)
-                readable = True  # it may be readable: it was not polled
+                readable = True  # it may be readable, because it was not polled
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1

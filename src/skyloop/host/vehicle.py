@@ -31,7 +31,7 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
 
-OPEN_S: Final = 10.0  #: time for a driver to open or close before its vehicle is dropped
+OPEN_S: Final = 10.0  #: time for a driver to open or close before its vehicle is given up
 _log = logging.getLogger(__name__)
 
 
@@ -41,12 +41,12 @@ class Condition(StrEnum):
     STOPPED = "stopped"  #: not started yet, or removed
     STARTING = "starting"
     RUNNING = "running"
-    RESTARTING = "restarting"  #: its own process died and will restart after a pause
+    RESTARTING = "restarting"  #: its own process died and will be restarted after a pause
     FAILED = "failed"
 
 
 class VehicleStatus(msgspec.Struct, frozen=True):
-    """One row in ``skyloop host status``."""
+    """One row in the output of ``skyloop host status``."""
 
     name: str
     address: str
@@ -89,12 +89,12 @@ class HostedVehicle(ABC):
     ) -> bool:
         """End the vehicle's flight and its proxy, like :meth:`skyloop.proxy.Proxy.end`. Idempotent.
 
-        Returns whether the proxy has ended; with ``unless_flying``, only if the vehicle landed in time.
+        Returns whether the proxy has ended. With ``unless_flying``, it only ends if the vehicle landed in time.
         """
 
     @property
     def runs(self) -> bool:
-        """Return whether the vehicle has a proxy or is about to have one."""
+        """Return whether the vehicle has a proxy or is about to get one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
@@ -110,9 +110,9 @@ class HostedVehicle(ABC):
 class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
-    ``reactor`` receives its local packets, ``jobs`` serves its slow requests, and ``network`` is None for this host
-    only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's row is shown.
-    ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
+    ``reactor`` receives the proxy's local packets, ``jobs`` serves its slow requests, and ``network`` is None if it
+    serves this host only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's
+    row is shown. ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
     """
 
     def __init__(
@@ -179,14 +179,14 @@ class SharedVehicle(HostedVehicle):
         return msgspec.structs.replace(row, **of_proxy(proxy))
 
     def report_stall(self, seconds: float) -> None:
-        """Publish that the driver blocks and that the vehicle no longer shares its threads."""
+        """Publish that the driver blocks, and that the vehicle no longer shares its threads."""
         proxy = self.proxy
         if proxy is not None:
             text = f"the driver has been blocking for {seconds:g} s: its vehicle no longer shares its threads"
             proxy.publisher.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="host")
 
     def fail(self, reason: str) -> bool:
-        """End a vehicle whose driver hangs or fails, and publish an event; return False if it was not running."""
+        """End a vehicle whose driver hangs or fails, and publish an event. Return False if it was not running."""
         with self._life:
             proxy = self.proxy
             if proxy is None or self.condition is not Condition.RUNNING:
@@ -231,7 +231,7 @@ def of_proxy(proxy: Proxy) -> dict[str, object]:
 
 
 def network_of(settings: VehicleSettings) -> FabricSettings | None:
-    """Return how a vehicle's proxy joins the network; None for this host only."""
+    """Return how a vehicle's proxy joins the network; None if it serves this host only."""
     if settings.network is None:
         return None
     from skyloop.network.config import serving
@@ -241,9 +241,9 @@ def network_of(settings: VehicleSettings) -> FabricSettings | None:
 
 
 def within(call: Callable[[], object], seconds: float) -> bool:
-    """Run something that may hang on a separate thread, and raise its exceptions here.
+    """Run a function that may hang on a separate thread, and raise its exceptions on this one.
 
-    Returns whether the call returned in time. Otherwise, the daemon thread keeps running.
+    Returns whether the function returned in time. Otherwise, the daemon thread continues to run.
     """
     raised: list[BaseException] = []
 

@@ -1,6 +1,6 @@
-"""Metrics of proxies, the cockpit and routers for Prometheus, collected only when scraped, never on a sample's path.
+"""Metrics of proxies, the cockpit and routers for Prometheus, collected only when they are scraped.
 
-They can be read on any thread, without taking any lock that a command waits for. Needs the extra ``metrics``.
+They can be read on any thread, without acquiring any lock that a command waits for. Requires the ``metrics`` extra.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ if TYPE_CHECKING:
     from skyloop.network.session import Session
     from skyloop.proxy import Proxy
 
-#: Counters of the proxy that are metrics, such as ``skyloop_feedback_missed_total``. Absent counters are exported as 0,
-#: except those of a network that is not served.
+#: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Counters that are absent are
+#: exported as 0, except those of a network that is not served.
 _COUNTERS: Final = (
     *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
     *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
     *("events.missed", "driver.errors"),
 )
 _NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
-#: Counters whose name contains a label: the parts of the name before and after it.
+#: Counters whose name contains a label. Each pair contains the parts of the name before and after the label.
 _LABELLED: Final = {
     "skyloop_commands_refused_total": ("commands.refused.", ""),
     "skyloop_events_total": ("events.of.", ""),
@@ -42,14 +42,14 @@ __all__ = ["FAMILIES", "Endpoint", "Reading", "Source", "serve"]  # re-exported 
 
 
 def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoint:
-    """Serve the metrics of the current proxies, which ``proxies`` returns for each scrape; see :func:`serve`."""
+    """Serve the metrics of the current proxies. ``proxies`` returns them for each scrape; see :func:`serve`."""
     return serve(lambda: [partial(proxy_readings, proxy) for proxy in proxies()], where)
 
 
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics, and announces where."""
+    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics and prints where."""
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
         endpoint = serve_proxies(lambda: proxies, where)
@@ -103,7 +103,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
     yield from _states("skyloop_client_link_state", (name,), drone.link.application, LinkState)
     for channel, stats in Known(drone).stats.items():
         if channel != "feedback" and (not channel.startswith("video/") or "?" in channel):
-            continue  # pages open any number of video streams, and an observer sends no commands
+            continue  # pages open any number of video streams, while an observer sends no commands
         labels = (name, channel)
         yield Reading("skyloop_client_received_total", float(stats.count), labels)
         yield Reading("skyloop_client_lost_total", float(stats.lost), labels)
@@ -133,6 +133,6 @@ def router_readings(session: Callable[[], Session]) -> Source:
 
 
 def _states(metric: str, labels: tuple[str, ...], current: Enum, states: type[Enum]) -> Iterator[Reading]:
-    """Yield 1 for the current state and 0 for each other."""
+    """Yield 1 for the current state and 0 for every other state."""
     for state in states:
         yield Reading(metric, float(state is current), (*labels, str(state.value)))

@@ -1,6 +1,6 @@
 """All metrics, as listed in ``docs/operations.md``, and the HTTP endpoint for Prometheus.
 
-The endpoint has its own threads, so a slow or stalled reader delays nothing else.
+The endpoint has its own threads, so a slow or stalled reader does not delay anything else.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Kind = Literal["gauge", "counter", "info"]
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One metric with all its labels. Names follow OpenMetrics: base units, ``_total`` for counters."""
+    """One metric with all its labels. Names follow OpenMetrics: base units, and ``_total`` for counters."""
 
     name: str
     kind: Kind
@@ -51,7 +51,7 @@ _CHANNEL: Final = ("vehicle", "channel")
 FAMILIES: Final[dict[str, Family]] = {
     family.name: family
     for family in (
-        # Metrics of each proxy; the label `vehicle` is the proxy's name.
+        # Metrics of each proxy. The label ``vehicle`` is the proxy's name.
         Family("skyloop_vehicle_info", "info", ("vehicle", "family"), "the vehicle's family"),
         Family("skyloop_vehicle_state", "gauge", ("vehicle", "state"), "1 for the current flight state, else 0"),
         Family(
@@ -123,7 +123,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_client_age_seconds", "gauge", _CHANNEL, "age of the newest sample"),
         Family("skyloop_cockpit_unreachable", "gauge", (), "discovered proxies that can't be connected to"),
         Family("skyloop_cockpit_pilots", "gauge", _VEHICLE, "pages that have or await the authority, or may stop"),
-        # Metrics of a router.
+        # Metrics of one router.
         Family("skyloop_router_links", "gauge", ("kind",), "links to others: router, peer (a proxy), client"),
         Family("skyloop_router_shut_out", "gauge", (), "linked nodes whose keys were revoked or changed"),
         # Metrics of each endpoint.
@@ -134,22 +134,22 @@ FAMILIES: Final[dict[str, Family]] = {
 
 LOOPBACK: Final = "127.0.0.1"
 PATH: Final = "/metrics"
-MAX_SCRAPES: Final = 8  #: simultaneous scrapes; one more closes the connection that has waited longest for its request
-ANSWER_S: Final = 1.0  #: a scrape is not closed in favour of a new connection before this time
+MAX_SCRAPES: Final = 8  #: maximum number of scrapes; one more closes the connection waiting longest for its request
+ANSWER_S: Final = 1.0  #: before this time, a scrape is not closed to make room for a new connection
 DEADLINE_S: Final = 10.0  #: maximum duration of a connection, from its first byte to its last
 _POLL_S: Final = 0.1  # interval at which the server thread checks whether to stop
 _log = logging.getLogger(__name__)
 
-#: Reads the current values of one source.
+#: Reads the current metrics of one source.
 Source = Callable[[], Iterable[Reading]]
 
 
 def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: float = DEADLINE_S) -> Endpoint:
     """Serve metrics over HTTP until the endpoint is closed.
 
-    ``sources`` and each source are called on the endpoint's threads for each scrape. ``where``: ``[HOST:]PORT``; the
-    host defaults to 127.0.0.1, and port 0 picks a free one. ``deadline_s``: maximum duration of a connection [s]; at
-    most :data:`MAX_SCRAPES` are open at a time.
+    ``sources`` is called on the endpoint's threads for each scrape, and so is each source. ``where``: ``[HOST:]PORT``.
+    The host defaults to 127.0.0.1, and port 0 picks a free port. ``deadline_s``: maximum duration of a connection [s].
+    At most :data:`MAX_SCRAPES` connections are open at a time.
     """
     return Endpoint(sources, parse_where(where), deadline_s)
 
@@ -163,7 +163,7 @@ def parse_where(where: str) -> tuple[str, int]:
 
 
 class Endpoint(AbstractContextManager["Endpoint"]):
-    """Serves metrics over HTTP. Created by :func:`serve`; a context manager that closes it."""
+    """Serves metrics over HTTP. Created by :func:`serve`. The context manager closes it."""
 
     def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
         """Start listening and answering; see :func:`serve`."""
@@ -202,7 +202,7 @@ class Endpoint(AbstractContextManager["Endpoint"]):
 class Collector:
     """Reads all sources on request, in the form that ``prometheus_client`` expects.
 
-    If a source fails, it is skipped, counted and logged; the others are still served.
+    If a source fails, it is skipped, counted and logged. The other sources are still served.
     """
 
     def __init__(self, sources: Callable[[], Iterable[Source]]) -> None:
@@ -275,7 +275,7 @@ class _Server(ThreadingHTTPServer):
         self._open: dict[Any, float] = {}  # connections, each protected until a given time; oldest first
 
     def server_bind(self) -> None:
-        # HTTPServer's own method looks up this machine's name on the network.
+        # The method of HTTPServer would look up this machine's name on the network.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
@@ -286,7 +286,7 @@ class _Server(ThreadingHTTPServer):
             now_s = time.monotonic()
             if len(self._open) >= MAX_SCRAPES:
                 idle = next((one for one, until_s in self._open.items() if until_s <= now_s), None)
-                if idle is not None:  # its thread ends with its next read or write
+                if idle is not None:  # the connection's thread ends with its next read or write
                     del self._open[idle]
                     _hang_up(idle)
             admitted = len(self._open) < MAX_SCRAPES
@@ -304,7 +304,7 @@ class _Server(ThreadingHTTPServer):
                 self._open[request] = time.monotonic() + ANSWER_S
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        # Limit the whole connection: with a limit per read, a byte every now and then could keep it open forever.
+        # Limit the whole connection: with a limit for each read, a byte now and then could keep it open forever.
         guard = threading.Timer(self._deadline_s, _hang_up, (request,))
         guard.daemon = True
         guard.start()
@@ -357,5 +357,5 @@ def _names_loopback(host: str) -> bool:
 
 
 def _hang_up(request: socket.socket) -> None:
-    with suppress(OSError):  # the other end is already gone
+    with suppress(OSError):  # the other end has already left
         request.shutdown(socket.SHUT_RDWR)

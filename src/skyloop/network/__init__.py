@@ -1,7 +1,7 @@
 """The network transport, built on Eclipse Zenoh.
 
-``docs/network.md`` shows how to use it, ``docs/wire-format.md`` describes its packets. It needs the extra ``network``;
-if that is not installed, every function here raises :class:`MissingExtraError`.
+``docs/network.md`` explains how to use it, and ``docs/wire-format.md`` describes its packets. The package needs the
+``network`` extra. If that is not installed, every function here raises :class:`MissingExtraError`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Admit applications that prove their identity with their keys, as long as there is room for them.
 
-When they exchange these proofs, the two ends also agree on the keys that seal their packets.
+The exchange of these proofs also gives the two ends the keys that seal their packets.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity, KeyRing
 
-MAX_CLIENTS: Final = 256  #: total connections: each costs memory, and time on the thread that calls the handler
-#: Connections allowed per key. A program needs one per drone; a lab's cockpit, recorders and workers share a key.
+MAX_CLIENTS: Final = 256  #: maximum number of connections; each costs memory, and time on the handler's thread
+#: Connections allowed per key. A program needs one per drone. A lab's cockpit, recorders and workers share a key.
 PER_KEY: Final = 64
-#: Connections reserved for keys that may fly this drone, so that other keys, however many, can't lock pilots out.
+#: Connections reserved for keys that may fly this drone, so that any number of other keys can't lock pilots out.
 FOR_PILOTS: Final = 64
-#: Tokens remembered per key, because a token arrives before its connection.
+#: Number of tokens remembered per key, because a token arrives before its connection.
 TOKENS_PER_KEY: Final = 4 * PER_KEY
-#: Total limit without keys: all applications then have the same name, and a flood looks like many applications.
+#: Total limit without keys. All applications then have the same name, so a flood from one looks like many applications.
 TOKENS: Final = 16 * MAX_CLIENTS
 
 
 class Admission(NamedTuple):
-    """The terms of a connection; without keys, only ``welcome`` is set."""
+    """The terms of a connection. Without keys, only ``welcome`` is set."""
 
     welcome: bytes = b""  #: the proxy's answer
     offer: bytes = b""  #: the proof contained in the request
     identity: Identity | None = None  #: the proven identity of the other end
-    expires: datetime | None = None  #: expiry of its key
+    expires: datetime | None = None  #: time at which its key expires
     sealer: Sealer = PLAIN  #: seals packets sent to the other end
     opener: Opener = PLAIN  #: opens packets received from the other end
     topics: Opener = PLAIN  #: opens published packets (in the application)
@@ -44,7 +44,7 @@ class Admission(NamedTuple):
 def admit(
     ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
-    """Check a request to join; return its terms, including the proxy's answer. Without keys, everyone is admitted."""
+    """Check a request to join. Return its terms, including the proxy's answer. Without keys, everyone is admitted."""
     if ring is None or topics is None:
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
     from skyloop.network.keys.agreement import Agreement
@@ -78,7 +78,7 @@ class JoinRequest:
             self.proof = self._agreement.offer()
 
     def accept(self, welcome: packets.Welcome) -> Admission:
-        """Check the proxy's answer; return the terms. An impostor's answer raises :class:`LinkError`."""
+        """Check the proxy's answer; return the terms. An answer from an impostor raises :class:`LinkError`."""
         if not self.proof:
             return Admission()
         agreed = self._agreement.accept(welcome.proof)
@@ -104,7 +104,7 @@ def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
 
 
 def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
-    """Return why there is no room for another connection from ``who``; empty if there is.
+    """Return why there is no room for another connection from ``who``; empty if there is room.
 
     ``present``: the identity behind each connection, and whether it may fly this drone.
     """
@@ -124,14 +124,14 @@ def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]
 
 
 class Tokens:
-    """The liveliness tokens of connections, limited per identity or, without keys, in total. Not thread-safe."""
+    """The liveliness tokens of connections, with a limit per identity or, without keys, in total. Not thread-safe."""
 
     def __init__(self, *, by_key: bool) -> None:
         self._most = TOKENS_PER_KEY if by_key else TOKENS
         self._seen: dict[str, set[str]] = {}
 
     def add(self, who: str, connection: str) -> bool:
-        """Add a token; return False if the identity has too many."""
+        """Add a token; return False if the identity has too many tokens."""
         seen = self._seen.setdefault(who, set())
         if len(seen) >= self._most and connection not in seen:
             return False
@@ -149,5 +149,5 @@ class Tokens:
         return connection in self._seen.get(who, ())
 
     def any_of(self, connections: Mapping[str, str]) -> bool:
-        """Return whether there is a token for any of these connections, given with their identities."""
+        """Return whether there is a token for any of these connections, which are given with their identities."""
         return any(self.has(who, connection) for connection, who in connections.items())

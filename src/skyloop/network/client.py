@@ -1,4 +1,4 @@
-"""The application's end of the fabric transport, and the topics to which it has subscribed."""
+"""The application's end of the fabric transport, and the topics that it has subscribed to."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ if TYPE_CHECKING:
 
     from skyloop.network.keys import Identity
 
-GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues elsewhere
+GLANCE_S: Final = 0.25  #: time for one session to find a proxy before the search continues with another session
 #: If a linked node takes longer than this to list its proxies after a loss, it has probably not noticed that its links
-#: ended before they were re-established: it then mistakes the new links for additional ones and announces nothing on
-#: them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
+#: ended before they were re-established. The node then mistakes the new links for additional links and announces
+#: nothing on them. The limit doubles each time, up to :data:`SYNC_S`, because the node may just be busy.
 LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
-STALLED_S: Final = 5.0  #: a proxy that has acknowledged nothing for this long is considered gone
+STALLED_S: Final = 5.0  #: after this time without an acknowledgement, a proxy is considered gone
 KEYS_S: Final = 0.5  #: interval between checks for a newer roster
 FAREWELL_S: Final = 0.3  #: time to wait for an answer to a bye
 _VIDEO: Final = video("")
@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """Return a dialer for a proxy on the network, which takes up to ``find_s`` [s] to find it.
+    """Return a dialer for a proxy on the network. The dialer may take up to ``find_s`` [s] to find the proxy.
 
     The dialer raises :class:`UnknownNameError` if no proxy with this name can be reached, and :class:`LinkError` if the
     proxy does not admit the application.
@@ -73,8 +73,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the other, but not vice versa. Such a session finds no proxy or gets no
-            # answers, and Zenoh does not notice. A new session has a new identity.
+            # One end may have forgotten the connection while the other has not, but not vice versa. Such a session
+            # finds no proxy or gets no answers, and Zenoh does not detect this. A new session has a new identity.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -84,7 +84,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             renew(session)
             release(session)
             raise
-        except NoAnswerError:  # the same cause: the links may have been re-established since the session was opened
+        except NoAnswerError:  # same cause: the links may have been re-established since the session was opened
             list_s = min(2.0 * list_s, SYNC_S)
             retire(session)
             release(session)
@@ -109,11 +109,11 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
 
 
 class Subscription:
-    """Sorts a topic's packets on Zenoh's threads and delivers them on the receiving thread.
+    """Sorts a topic's packets on Zenoh's threads, and delivers them on the receiving thread.
 
-    ``run``: the proxy's run; packets that others publish under its name are ignored. ``enqueue``: called with this
-    subscription, a packet (empty: a frame is due) and its number, which must be passed to :meth:`deliver` in order.
-    ``reject``: called with the reason when a packet did not come from the proxy.
+    ``run``: the proxy's run. Packets that others publish under its name are ignored. ``enqueue``: called with this
+    subscription, a packet (empty: a frame is due) and the packet's number, which must be passed to :meth:`deliver` in
+    order. ``reject``: called with the reason when a packet did not come from the proxy.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Subscription:
         self._opener = opener
         self._enqueue = enqueue
         self._reject = reject
-        #: Whether only the newest packet counts, so that packets and their acknowledgements are sent as datagrams.
+        #: Whether only the newest packet matters. Packets and their acknowledgements are then sent as datagrams.
         self.newest_wins = layout.newest_wins(topic)
         self._ack_policy = AckPolicy(ACKNOWLEDGE_EVERY_S) if self.newest_wins else AckPolicy()
         self._recent = RecentPackets()
@@ -148,11 +148,11 @@ class Subscription:
         return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
 
     def end(self) -> None:
-        """Stop delivering frames, including queued ones."""
+        """Stop delivering frames, including frames that are already queued."""
         self._ended = True
 
     def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
-        """Deliver the next item to the handler; return the packet that acknowledges it, empty if none is needed."""
+        """Deliver the next item to the handler. Return the packet that acknowledges it; empty if none is needed."""
         if packet:
             self._waiting -= 1
             handler.packet(packet)
@@ -180,7 +180,7 @@ class Subscription:
             self._enqueue(self, packet, number)
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
-        """Queue a frame, replacing one that is already queued."""
+        """Queue a frame, replacing any frame that is already queued."""
         opener = self._opener
         try:
             attachment = packets.copied(sample.attachment, packets.MAX_OWN)
@@ -201,17 +201,17 @@ class Subscription:
             self._enqueue(self, b"", number)
 
 
-#: Items for the receiving thread: a packet of a topic (None: sent to this end only; empty: a frame), its number.
+#: Items for the receiving thread: a topic (None: sent to this end only), its packet (empty: a frame), its number.
 _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
 
 class FabricClient(TransportClient):
-    """The application's end, created by the dialer from :func:`dial`.
+    """The application's end of the transport. The dialer from :func:`dial` creates it.
 
     It releases its session when the connection ends, but not if the constructor raises :class:`UnknownNameError` (no
     such proxy after ``find_s`` and, for linked nodes to list theirs, ``list_s`` [s]), :class:`LinkError` (the proxy
-    does not admit this application) or :class:`NoAnswerError`. ``known``: the proxy's description, if received earlier.
+    does not admit this application) or :class:`NoAnswerError`. ``known``: the proxy's description, if received before.
     """
 
     def __init__(
@@ -231,24 +231,24 @@ class FabricClient(TransportClient):
         identity = session.settings.identity
         self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""  # the proxy's run, set once a proxy has been asked to admit us
+        self._run = ""  # the proxy's run, set once a proxy has been asked to admit this application
         self._lock = threading.Lock()  # guards the following attributes; held while sending, to keep packets in order
         self._outgoing = Outgoing()
-        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each with its declarations
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # each subscription with its declarations
         self._command: zenoh.Publisher | None = None
         self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
         self._report: zenoh.Publisher | None = None
         self._report_key = layout.upward(layout.ASK, name, self._who, self._id)
         self._ring = session.settings.ring
         self._pause_s = None if self._ring is None else KEYS_S
-        self._keys_s = 0.0  # when to check the keys next
-        self._admission = Admission()  # with keys: the proxy's identity, and seals for the packets
+        self._keys_s = 0.0  # time of the next check of the keys
+        self._admission = Admission()  # with keys: the proxy's identity, and the seals for packets
         self.forged = 0  #: number of packets and frames that did not come from the proxy
-        self._receiver = Receiver()  # packets for this end only
+        self._receiver = Receiver()  # packets that are only for this end
         self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
         self._ended = False  # nothing more can be sent
-        self._closing = False  # closed by this end: nothing more is delivered
-        self._farewell = threading.Event()  # set when the proxy has answered our bye, or is gone
+        self._closing = False  # this end has closed the connection: nothing more is delivered
+        self._farewell = threading.Event()  # set when the proxy has answered our bye, or has ended
         self._reason = ""
         self._held: list[Any] = []
         try:
@@ -278,7 +278,7 @@ class FabricClient(TransportClient):
             else:
                 return about
 
-    # --- calls of the application ---
+    # --- calls by the application ---
 
     def send(self, packet: bytes) -> bool:
         if not 0 < len(packet) <= MAX_PACKET:
@@ -313,7 +313,7 @@ class FabricClient(TransportClient):
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
-        if not sent:  # nothing would arrive on this connection; the next one subscribes again
+        if not sent:  # nothing would arrive on this connection; the next connection subscribes again
             self._end(f"the proxy accepts no packets: the subscription to {topic!r} can't be sent")
 
     def close(self) -> None:
@@ -348,7 +348,7 @@ class FabricClient(TransportClient):
         return self._send_once(self._report, self._report_key, packet)
 
     def _send_once(self, publisher: zenoh.Publisher, key: str, packet: bytes) -> bool:
-        """Send a packet that may be lost, without waiting."""
+        """Send a packet that may be lost. Never waits."""
         payload, attachment = self._admission.sealer.seal(key, _UNNUMBERED, packet)
         try:
             publisher.put(payload, attachment=attachment)
@@ -389,11 +389,11 @@ class FabricClient(TransportClient):
             self._end("the proxy is gone")
 
     def _on_packet(self, sample: zenoh.Sample) -> None:
-        """Handle a packet sent to this application only."""
+        """Handle a packet that was sent only to this application."""
         try:
             opened = contents(self._admission.opener, sample)
             if opened is None:
-                return  # already received on another path
+                return  # the packet was already received by another path
             packet, number = opened[0], packets.parse_number(opened[1])
         except DecodeError as error:
             self._reject(error)
@@ -436,7 +436,7 @@ class FabricClient(TransportClient):
         self._inbox.put((subscription, packet, number))
 
     def _reject(self, error: DecodeError) -> None:
-        """Count a sample that did not come from the proxy; log the first one."""
+        """Count a sample that did not come from the proxy, and log the first such sample."""
         self.forged += 1
         if self.forged == 1:
             _log.warning("%s: ignored a packet that the proxy did not send: %s", self._name, error)
@@ -469,12 +469,12 @@ class FabricClient(TransportClient):
     # --- the end of the connection ---
 
     def _end(self, reason: str) -> None:
-        """End the connection, once; the receiving thread does the rest. Any thread."""
+        """End the connection. Only the first call counts, and the receiving thread does the rest. Any thread."""
         with self._lock:
             if self._ended:
                 return
             self._reason = self._reason or reason
-            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # sent after everything that was sent before
+            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # sent after all previous packets
                 self._put(layout.ASK, packets.bye(reason), 0)
             self._ended = True
         self._inbox.put(None)
@@ -488,7 +488,7 @@ class FabricClient(TransportClient):
         held += [publisher for publisher in (self._command, self._report) if publisher is not None]
         undeclare(held)
 
-    # --- the receiving thread ---
+    # --- on the receiving thread ---
 
     def _receive(self) -> None:
         while (item := self._next()) is not None:
@@ -534,7 +534,7 @@ class FabricClient(TransportClient):
             self._acknowledge(answer, once=subscription.newest_wins)
 
     def _acknowledge(self, packet: bytes, *, once: bool = False) -> None:
-        """Acknowledge a packet; ``once``: in a datagram, which may be lost."""
+        """Acknowledge a packet. ``once``: in a datagram, which may be lost."""
         with self._lock:
             if self._ended:
                 return
@@ -545,7 +545,7 @@ class FabricClient(TransportClient):
 
 
 def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
-    """Return the reply to a request that an application's keys don't allow, which is then not sent to the proxy.
+    """Return the reply to a request that an application's keys don't allow. Such a request does not reach the proxy.
 
     None if the packet is not a request.
     """

@@ -1,6 +1,6 @@
 """Read network settings from arguments and the environment, and create Zenoh's configuration from them.
 
-Pure, except for reading the environment and finding a free port.
+Pure, except that it reads the environment and finds a free port.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from skyloop.network.layout import ANYONE, check_identity
 if TYPE_CHECKING:
     from skyloop.network.keys import Credentials, Identity, KeyRing
 
-LEASE_S: Final = 0.7  #: default time without a sign of life after which a peer is considered gone
+LEASE_S: Final = 0.7  #: default time without any packet after which a peer is considered gone
 MAX_LEASE_S: Final = 10.0  #: longest lease that can be set
 DEFAULT_PORT: Final = 7447  #: Zenoh's default port
 #: Time for an address to answer before the peer's next address is tried.
 OPEN_MS: Final = 800
-#: The same for addresses given explicitly: all are tried at once, and one may lead to a mobile network, where answers
-#: after an outage are stuck behind old video. An end that gives up just before the last answer leaves a half-open link
-#: at the far end; Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
+#: The same for addresses that were given explicitly. All are tried at once, and one may lead to a mobile network, where
+#: answers after an outage are queued behind old video. An end that gives up just before the last answer leaves a
+#: half-open link at the other end. Zenoh mistakes the next link for a duplicate and does not repeat declarations on it.
 OPEN_GIVEN_MS: Final = 1500
-#: How long opening a session waits to discover others (Zenoh's default). An application with a single address waits
-#: only for the proxy at that address; one with several must find every proxy with the name.
+#: How long a session waits to discover others when it is opened (Zenoh's default). An application with one address
+#: waits only for the proxy at that address. With several, it must find all proxies with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
 #: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
@@ -63,25 +63,25 @@ class FabricSettings:
     """How to join the network: by default, via multicast on this host's network segments, without keys.
 
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
-    (port 7447). Each means both TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC
-    with keys. An address may also be a full Zenoh endpoint such as ``tcp/10.0.0.5:7447``, which is used unchanged.
+    (port 7447). Each means TCP (packets that must arrive) and UDP (commands and feedback) without keys, and QUIC with
+    keys. An address may also be a full Zenoh endpoint such as ``tcp/10.0.0.5:7447``, which is used unchanged.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     multicast: bool = True  #: discover by UDP multicast on this host's network segments
     tls: TlsFiles | None = None
-    #: Silence after which a link is considered lost [s]. Peers learn this value; applications add 0.3 s. A mobile
-    #: network may be silent for seconds, and need another second to deliver lost packets.
+    #: Silence after which a link is considered lost [s]. Peers learn this value, and applications add 0.3 s to it. A
+    #: mobile network may be silent for seconds, and may need another second to deliver lost packets.
     lease_s: float = LEASE_S
-    who: str = ANYONE  #: the identity: the certificate's common name
+    who: str = ANYONE  #: the identity, which is the certificate's common name
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), or None.
     access_control: dict[str, Any] | None = None
-    #: The keys from which ``tls`` and ``access_control`` were made.
+    #: The keys that ``tls`` and ``access_control`` were made from.
     ring: KeyRing | None = field(default=None, compare=False)
 
     def current(self) -> FabricSettings:
-        """Return these settings with the newest roster in the folder; :class:`LinkError` if it revokes our keys."""
+        """Return these settings with the folder's newest roster; raise :class:`LinkError` if it revokes our keys."""
         if self.ring is None:
             return self
         self.ring.refresh()
@@ -94,18 +94,18 @@ class FabricSettings:
 
     @property
     def excused_s(self) -> float:
-        """Time that silence is tolerated beyond the default [s]."""
+        """How much longer than the default a silence may last [s]."""
         return self.lease_s - LEASE_S
 
     @property
     def reach(self) -> str:
-        """Text for users that says where proxies are searched for."""
+        """Text that tells users where proxies are searched for."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 
     @property
     def identity(self) -> Identity | None:
-        """The identity of the keys; None without keys."""
+        """The identity that the keys belong to; None without keys."""
         return None if self.ring is None else self.ring.credentials.identity
 
     def __post_init__(self) -> None:
@@ -117,8 +117,8 @@ class FabricSettings:
 
 
 def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
-    """Return these settings with keys: mutual TLS over QUIC, and access control based on their roster."""
-    from skyloop.network.keys import KeyRing  # imported only if there are keys: needs cryptography
+    """Return these settings with keys added: mutual TLS over QUIC, and access control based on the keys' roster."""
+    from skyloop.network.keys import KeyRing  # imported only if there are keys, because it needs cryptography
     from skyloop.network.keys.identity import access_control
 
     return replace(
@@ -130,13 +130,13 @@ def secured(settings: FabricSettings, credentials: Credentials) -> FabricSetting
     )
 
 
-#: ``True``: discover by multicast; a string: addresses to connect to, separated by commas, plus ``multicast`` to
-#: discover as well; ``False``: this host only; ``None``: decided by the environment.
+#: ``True``: discover by multicast. A string: addresses to connect to, separated by commas, and ``multicast`` to
+#: discover as well. ``False``: this host only. ``None``: the environment decides.
 NetworkChoice = bool | str | FabricSettings | None
 
 
 def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return the network settings, or None to stay on this host; by default, the environment's.
+    """Return the network settings, or None to stay on this host. By default, they come from the environment.
 
     Log a warning if the key expires within a week. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
@@ -168,8 +168,8 @@ def serving(
 ) -> FabricSettings:
     """Return the network settings for a proxy, a host or a router.
 
-    ``network``: ``multicast``, or routers' addresses separated by commas, which may include ``multicast`` to use both.
-    ``multicast=False`` forbids multicast in any case. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
+    ``network``: ``multicast``, or routers' addresses separated by commas. The list may include ``multicast`` to use
+    both. ``multicast=False`` always forbids multicast. ``keys``: an identity's folder, by default ``SKYLOOP_KEYS``.
     """
     words = [word.strip() for word in network.split(",") if word.strip()]
     if not words:
@@ -187,7 +187,7 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Create network settings; ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
+    """Create network settings. ``keys`` is an identity's folder, by default ``SKYLOOP_KEYS``."""
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast, lease_s=_lease_s())
     endpoints_of((*listen, *connect), found)  # reports invalid addresses before anything is opened
     folder = keys or os.environ.get(KEYS_VARIABLE) or None
@@ -204,7 +204,7 @@ def _lease_s() -> float:
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """Return these settings with the identity in the given folder."""
+    """Return these settings with the identity from the given folder."""
     from skyloop.network.keys import load  # imported only if there are keys: needs cryptography
 
     found = secured(plain, load(folder))
@@ -220,21 +220,21 @@ class Part(StrEnum):
     ROUTER = "router"  #: joins ends that can't reach one another directly
 
 
-#: Signs of life per lease: enough for some to arrive on a path that loses three packets in ten.
+#: Number of keep-alive packets per lease. It is enough for some to arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
-#: Messages queued for sending, by priority (Zenoh's maximum). Zenoh's default of 2 drops further ones within a
-#: millisecond, and ten drones in one process can report the same event at the same moment.
+#: Number of messages queued for sending at each priority (Zenoh's maximum). Zenoh's default of 2 drops further messages
+#: within a millisecond, and ten drones in one process can report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Override what a neighbour requests, so that no slow reader blocks another, neither here nor through a router. Answers
-#: are sent in the same way as their queries.
+#: Override what a neighbour requests, so that no slow reader blocks another, either here or through a router. Answers
+#: travel in the same way as the queries.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
     "messages": ["put", "delete", "query"],
     "flows": ["ingress", "egress"],
     "overwrite": {"congestion_control": "drop"},
 }
-#: Separates proxies from applications in Zenoh: a router forwards between regions, and assumes that the nodes within a
-#: region reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
+#: Separates proxies from applications in Zenoh. A router forwards messages between regions, and assumes that the nodes
+#: within a region reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
 _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
@@ -243,8 +243,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     lease_ms = round(settings.lease_s * 1000)
-    # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long, because one of Zenoh's few
-    # receiving threads is blocked until then. All other messages are dropped when a link is congested.
+    # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long. Until then, it blocks one of
+    # Zenoh's few receiving threads. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
@@ -278,8 +278,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
         found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
     else:
         found["region_name"] = _REGIONS[part]
-        # Don't act as a gateway for Zenoh "clients", which are not admitted: all our nodes are peers. A gateway would
-        # forward each client's declarations, and thousands of them would block it for seconds.
+        # Don't act as a gateway for Zenoh "clients". Such nodes are not admitted, because all our nodes are peers. A
+        # gateway would forward the declarations of every client, and thousands of them would block it for seconds.
         found["gateway"] = {"south": []}
     if settings.tls is not None:
         found["transport"]["link"]["tls"] = _tls(settings)
@@ -308,7 +308,7 @@ def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str
 
 
 def to_json(sections: dict[str, Any]) -> str:
-    """Return a configuration as JSON, for Zenoh's own programs."""
+    """Return a configuration as JSON, in the form that Zenoh's own programs read."""
     return json.dumps(sections, indent=2)
 
 
@@ -344,8 +344,8 @@ def free_port(host: str) -> int:
 def _called(part: Part, has_addresses: bool) -> list[str]:
     """Return the kinds of nodes to connect to when they are discovered.
 
-    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node that was given
-    addresses connects to no other routers, because a discovered router is not retried as often as an address.
+    Only applications connect to proxies, so a hundred proxies have no links to one another. A node that was given
+    addresses connects to no other routers, because a discovered router is not retried as often as a given address.
     """
     if part is Part.APP:
         return ["router", "peer"]
@@ -362,7 +362,7 @@ def _tls(settings: FabricSettings) -> dict[str, Any]:
         "connect_certificate": certificate,
         "connect_private_key": key,
         "enable_mtls": True,
-        # A certificate proves an identity, which may be at any address.
+        # A certificate proves an identity, independently of its address.
         "verify_name_on_connect": False,
         "close_link_on_expiration": True,
     }

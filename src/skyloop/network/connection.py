@@ -1,6 +1,6 @@
-"""The connections of applications at a transport server, and a thread that sends to individual ones.
+"""The connections of applications at a transport server, and a thread that sends to individual applications.
 
-Threads that answer an application only queue the answer here, and the sending thread never waits for an application. An
+Threads that answer an application only queue the answer here. The sending thread never waits for an application. An
 application that acknowledges nothing uses a bounded amount of memory.
 """
 
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     import zenoh
 
 #: Maximum number of one application's packets, and of its commands, that wait for the handler. Further packets are not
-#: acknowledged and are therefore resent; further commands are dropped: newer ones follow. Set-points count as one.
+#: acknowledged and are therefore resent. Further commands are dropped, as newer ones follow. Set-points count as one.
 MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
-_OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are requested again
+_OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are then requested again
 _log = logging.getLogger(__name__)
 _VIDEO: Final = video("")
 _STREAMS: Final = stream("")
@@ -45,34 +45,34 @@ class ServerConnection:
         self.who = who
         self.id = connection
         self.admission = admission
-        self.joined_s = joined_s  #: when the application asked to join
-        self.commands = PacketBacklog(MAX_WAITING)  #: commands waiting for the handler; guarded by the server
-        self.announced = False  #: the handler knows the application
-        self.confirmed = False  #: its token has been seen, so Zenoh will report its end
+        self.joined_s = joined_s  #: time at which the application asked to join
+        self.commands = PacketBacklog(MAX_WAITING)  #: commands that wait for the handler; the server guards them
+        self.announced = False  #: the handler was told about the application
+        self.confirmed = False  #: its token has been seen, so Zenoh will report when it ends
         self.ended = False  #: further packets from the application are ignored
-        self.reason = ""  #: why the connection ends, once either end has given a reason
+        self.reason = ""  #: the reason why the connection ends, once either end has given one
         self.lock = threading.Lock()
         self.outgoing = Outgoing()  #: packets to the application
         self.receiver = Receiver()  #: packets from the application
         self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's own packets to the application
         self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
-        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number up to which it is acknowledged
-        self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet counts
-        self.left = False  #: the application has unsubscribed from everything for good
+        self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged packet
+        self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet matters
+        self.left = False  #: the application has unsubscribed for good from every topic
 
     def may_command(self, drone: str) -> bool:
-        """Return whether the application's proven identity permits more than queries to this drone."""
+        """Return whether the application's proven identity permits more than queries about this drone."""
         identity = self.admission.identity
         return identity is None or identity.may_fly(drone)
 
     def lags(self, topic: str, number: int) -> bool:
-        """Return whether a topic's next packet has no room, because more than :data:`DEPTH` are unacknowledged."""
+        """Return whether a topic's next packet must wait, because more than :data:`DEPTH` are unacknowledged."""
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet the application has acknowledged a topic, or (if empty) packets to it alone.
+        """Record up to which packet the application has acknowledged a topic (if empty, the packets to it alone).
 
-        Returns whether further packets that go only to this application may be due.
+        Returns whether more packets that go only to this application may be waiting.
         """
         with self.lock:
             if not topic:
@@ -85,19 +85,19 @@ class ServerConnection:
             return False
 
     def queue(self, packet: bytes) -> str:
-        """Keep a packet until it is acknowledged; return why there is no room for it, or an empty string."""
+        """Keep a packet until it is acknowledged. Return why there is no room for the packet, or an empty string."""
         with self.lock:
             if self.outgoing.put(packet):
                 return ""
         return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, are unacknowledged"
 
     def stalled_s(self, now_s: float) -> float:
-        """Return for how long nothing has been acknowledged [s]; 0 if no packet is unacknowledged."""
+        """Return for how long nothing has been acknowledged [s]; 0 if no packet is waiting for an acknowledgement."""
         with self.lock:
             return self.outgoing.stalled_s(now_s)
 
     def queue_own(self, packet: bytes) -> None:
-        """Queue one of the transport's own packets, which is sent only once and may be lost."""
+        """Queue one of the transport's own packets. Such packets are sent only once and may be lost."""
         with self.lock:
             self._own.append(packet)
 
@@ -107,18 +107,18 @@ class ServerConnection:
             self._taken = max(self._taken, number)
 
     def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
-        """Return the packets to send now (number 0: the transport's own), and whether more may become due later."""
+        """Return the packets to send now (number 0: the transport's own), and whether others may become due later."""
         with self.lock:
             found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
             if self._taken:
                 found.insert(0, (0, packets.taken("", self._taken)))
                 self._taken = 0
-            found += [(0, packet) for packet in self._own]  # a bye is sent last
+            found += [(0, packet) for packet in self._own]  # a bye is always the last packet
             self._own.clear()
             return found, self.outgoing.under_way and not self.ended
 
 
-#: Sends a packet to an application, with number 0 if it may be lost.
+#: Sends a packet to an application. The number is 0 if the packet may be lost.
 Put = Callable[[ServerConnection, bytes, int], object]
 
 
@@ -137,7 +137,7 @@ class Sender:
         self._thread.start()
 
     def wake(self, connection: ServerConnection) -> None:
-        """Schedule the sending of a connection's due packets. Any thread."""
+        """Schedule the sending of the packets that are due on a connection. Any thread."""
         with self._changed:
             self._ready[connection] = None
             self._changed.notify()
@@ -176,14 +176,14 @@ class Sender:
 
 
 class Publisher:
-    """Keeps the subscriptions of all connections and publishes to them. Thread-safe."""
+    """Stores the subscriptions of all connections, and publishes to the subscribers. Thread-safe."""
 
     def __init__(self, name: str, run: str, sealer: Sealer, clock: Callable[[], float] = time.monotonic) -> None:
         self._name = name
         self._run = bytes.fromhex(run)
         self._sealer = sealer
         self._clock = clock
-        self.held_back = 0  #: number of packets skipped because all subscribers were silent
+        self.held_back = 0  #: number of packets that were skipped because all subscribers were silent
         self._lock = threading.RLock()  # guards the following attributes
         self._session: Session | None = None  # set while publishing is possible
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
@@ -201,16 +201,16 @@ class Publisher:
     def close(self) -> None:
         """Stop publishing.
 
-        Publishers aren't undeclared, because that fails while another thread uses one; each ends with its last user.
+        Publishers are never undeclared, because this fails while another thread uses one. Each ends with its last user.
         """
         with self._lock:
             self._session = None
             self._publishers.clear()
 
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to all subscribers of a topic; return how many are too far behind to receive it.
+        """Send a packet to all subscribers of a topic; return how many subscribers are too far behind to receive it.
 
-        On a topic where only the newest packet counts, most packets are skipped while the paths to all subscribers are
+        On a topic where only the newest packet matters, most packets are skipped while the paths to all subscribers are
         stalled.
         """
         with self._lock:
@@ -234,14 +234,14 @@ class Publisher:
         try:
             if publisher is not None:
                 publisher.put(payload, attachment=attachment)
-            else:  # the topic was named by an application: leave no declaration behind
+            else:  # an application chose the topic's name: leave no declaration behind
                 session.put(key, payload, attachment, "DATA")
         except load().ZError:
             return len(subscribed)  # stopping
         return sum(connection.lags(topic, number) for connection in subscribed)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
+        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         if topic.startswith(_VIDEO) and "?" not in topic:
             return self.video.readers(topic.removeprefix(_VIDEO))
         return len(self._subscribed.get(topic, ()))
@@ -293,7 +293,7 @@ class Publisher:
             self._subscribed.pop(topic, None)
             if topic.startswith((_RESULTS, _STREAMS)) or "?" in topic:  # named by an application: keep nothing
                 self._numbers.pop(topic, None)
-                self._publishers.pop(topic, None)  # freed once its last user drops it
+                self._publishers.pop(topic, None)  # freed when its last user releases it
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         newest_wins = layout.newest_wins(topic)

@@ -1,8 +1,8 @@
-"""Discovery: list the network's proxies, find one that comes back, and join one.
+"""Discovery: list the network's proxies, find a proxy that comes back, and join a proxy.
 
-Zenoh retries the addresses it was given, but searches by multicast only after 1, 2, 4 and then every 8 seconds. An
-application that misses a proxy therefore searches here, without a connection. If a node answers that the current
-session does not know, the application opens a new session, which finds that node within milliseconds.
+Zenoh retries the addresses that it was given, but repeats its multicast search only after 1, 2, 4 and then every 8
+seconds. An application that does not find a proxy therefore searches here, without a connection. If a node answers that
+the current session does not know about, the application opens a new session, which finds that node within milliseconds.
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ if TYPE_CHECKING:
 
     import zenoh
 
-#: Time for a newly opened session to find all nodes within reach, either by multicast or at the given addresses.
+#: Time that a newly opened session needs to find all nodes within reach, by multicast or at the given addresses.
 SETTLE_S: Final = 0.6
 ANSWER_S: Final = 0.5  #: time for proxies to send their descriptions
-#: Time for a linked node to list the tokens that it knows: normally milliseconds, unless it is flooded with tokens.
+#: Time for a linked node to list the tokens that it knows. It needs milliseconds unless it is flooded with tokens.
 SYNC_S: Final = 5.0
-RUNS_PER_NAME: Final = 8  #: proxies listed per name: usually one; two or three if the network was split
-SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
-YOUNG_S: Final = 1.0  #: age up to which a session needs no help with searching
-FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not retried for this long
+RUNS_PER_NAME: Final = 8  #: maximum number of proxies listed per name; a split network may have two or three
+SEARCH_S: Final = 0.25  #: time to wait for answers to a search
+YOUNG_S: Final = 1.0  #: maximum age of a session that does not need help with its search
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not tried again for this long
 _POLL_S: Final = 0.05
 JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
-MAX_CANDIDATES: Final = 4  #: with keys: how many proxies with the same name to ask until one proves its identity
+MAX_CANDIDATES: Final = 4  #: with keys: maximum number of proxies of this name to ask until one proves its identity
 
 
 def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
-    """List the proxies that this process can reach over the network, by name and age. Takes about a second."""
+    """List the proxies that this process can reach over the network, sorted by name and age. Takes about a second."""
     session = acquire(settings, Part.APP)
     try:
         _settle(session)
-        runs(session)  # once this is answered, all reachable nodes are known
+        runs(session)  # once this request has been answered, all reachable nodes are known
         return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
     finally:
         release(session)
@@ -59,7 +59,7 @@ def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
 def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
     """Return the proxies with this name, oldest first. There are several only if a network was split."""
     if not settings.multicast and not settings.connect:
-        return []  # others would have to connect to us, but we don't listen yet
+        return []  # other nodes would have to connect to this one, which does not listen yet
     session = acquire(replace(settings, listen=()), Part.APP)
     try:
         _settle(session)
@@ -77,7 +77,7 @@ def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
     """Return NAME and RUN of the transport servers whose tokens are currently visible.
 
-    This takes as long as the linked nodes need to send their tokens, but at most :data:`SYNC_S`.
+    This call takes as long as the linked nodes need to send their tokens, but no more than :data:`SYNC_S`.
     """
     return listed(session, name)[0]
 
@@ -137,14 +137,14 @@ class UnreachablePeers:
         self._tried: dict[str, float] = {}
 
     def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
-        """Return whether an answer came from an unknown peer for which no session has been opened yet."""
+        """Return whether an unknown peer answered for which no session has been opened yet."""
         self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
         new = answered - known - self._tried.keys()
         self._tried |= dict.fromkeys(new, now_s)
         return bool(new)
 
     def clear(self) -> None:
-        """Forget the peers: after a proxy was reached, earlier failures say nothing about the next attempt."""
+        """Forget the peers: once a proxy has been reached, earlier failures say nothing about the next attempt."""
         self._tried.clear()
 
 
@@ -159,7 +159,7 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know. If there are any, retire the session and return True."""
+    """Search for nodes that a session does not know about. If new ones answer, retire the session and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
@@ -172,7 +172,7 @@ def renew(session: Session) -> bool:
 
 
 def _search(session: Session) -> set[str]:
-    """Return the identities of the nodes that answer now and accept connections."""
+    """Return the identities of the nodes that currently answer and accept connections."""
     answered: set[str] = set()
 
     def hello(answer: Any) -> None:
@@ -189,10 +189,10 @@ def _search(session: Session) -> set[str]:
 
 
 class ProxyWatch:
-    """Monitors which transport servers with one name are alive.
+    """Monitors which transport servers with a given name are alive.
 
-    ``on_gone``: called on one of Zenoh's threads with the run of a proxy that disappears. ``known``: the description of
-    a proxy with this name, if received earlier; it is not requested again.
+    ``on_gone`` is called on one of Zenoh's threads with the run of each proxy that disappears. ``known``: the
+    description of a proxy with this name, if it was received earlier. The description is then not requested again.
     """
 
     def __init__(
@@ -214,14 +214,14 @@ class ProxyWatch:
     def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
         """Wait for a proxy with this name, then up to ``list_s`` [s] for linked nodes to list theirs.
 
-        Returns each candidate's run and description, best first. The best is the oldest; with keys the others follow,
-        because the oldest may have no key for this name. Raises :class:`UnknownNameError` if there is none, and
+        Returns each candidate's run and description, best first. The best one is the oldest. With keys, the others
+        follow, because the oldest may have no key for this name. Raises :class:`UnknownNameError` if there is none, and
         :class:`NoAnswerError` if one was found but has disappeared, or a linked node does not list its tokens.
         """
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
         if not found:
-            # A node flooded with tokens may list many others before the proxy's token, so wait for all of them.
+            # A node that is flooded with tokens may list many others before the proxy's token, so wait for all of them.
             known, complete = listed(self._session, within_s=list_s)
             with self._changed:
                 self._runs.update(run for other, run in known if other == self._name)
@@ -264,7 +264,7 @@ class ProxyWatch:
 
 
 def join(session: Session, name: str, run: str, connection: str) -> Admission:
-    """Ask one run of a proxy to admit a connection; return its terms."""
+    """Ask one run of a proxy to admit a connection, and return the connection's terms."""
     z, who, ring = load(), session.settings.who, session.settings.ring
     request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))
     program = Path(sys.argv[0]).name[:64]
@@ -282,7 +282,7 @@ def join(session: Session, name: str, run: str, connection: str) -> Admission:
     for reply in replies:
         if reply.err is not None:
             words = reply.err.payload.to_string()[:400]
-            if words == TIMED_OUT:  # sent by a router after a time-out, so it is not a refusal
+            if words == TIMED_OUT:  # a router sent it after a time-out, so it is not a refusal
                 continue
             raise LinkError(f"the proxy {name!r} does not admit us: {words}")
         try:

@@ -1,7 +1,7 @@
-"""Send the server's video. Each subscribed variant of a frame is encoded once and sent no faster than readers take it.
+"""Send the server's video. Each subscribed variant of a frame is encoded once and sent at its readers' pace.
 
-Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until the reader acknowledges one;
-then it gets the newest. A slow link thus shows fewer frames, but never old ones.
+Up to :data:`WINDOW` frames are in flight to each reader. Further frames are skipped until the reader acknowledges one.
+The reader then gets the newest frame. A slow link therefore shows fewer frames, but never old ones.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from skyloop.messages.subscription import FrameFilter, VideoRequest
 from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
-WINDOW: Final = 2  #: number of frames in flight to one reader
-#: Formats of one camera's frames. Each is encoded separately; a format split into n parts costs no more than a whole
-#: one. The default formats are not counted, which leaves room for a pilot whatever others request.
+WINDOW: Final = 2  #: maximum number of frames in flight to one reader
+#: The formats of one camera's frames. Each format is encoded separately. A format split into n parts costs no more than
+#: a whole one. The default formats are not counted, so there is always room for a pilot, whatever others request.
 MAX_FORMS: Final = 32
-MAX_FORMS_EACH: Final = 8  #: number of formats that one connection may read
-#: A frame not acknowledged for this long is considered lost, because Zenoh drops what a congested link can't carry.
+MAX_FORMS_EACH: Final = 8  #: maximum number of formats that one connection may read
+#: A frame not acknowledged after this time is considered lost: Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
-#: Sends one encoded frame of a variant, either to all its readers or to the given connections.
+#: Sends one encoded frame of a variant, either to all readers of the variant or only to the given connections.
 Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
 
 
@@ -46,13 +46,13 @@ class PublishedFrame:
 
 
 class Reader:
-    """The frames in flight to one connection."""
+    """The frames that are in flight to one connection."""
 
     __slots__ = ("_on_way", "due", "waits")
 
     def __init__(self) -> None:
-        self._on_way: deque[tuple[int, int]] = deque()  # number and time sent
-        self.due = False  #: the newest frame should be sent to it
+        self._on_way: deque[tuple[int, int]] = deque()  # number of each frame, and the time when it was sent
+        self.due = False  #: the newest frame should be sent to this connection
         self.waits = False  #: the connection has missed a frame
 
     def has_room(self, now_ns: int) -> bool:
@@ -67,13 +67,13 @@ class Reader:
         self.due, self.waits = True, False
 
     def sent(self, number: int, now_ns: int) -> None:
-        """Record that the due frame, or a newer one in its place, was sent."""
+        """Record that the frame that was due, or a newer frame in its place, was sent."""
         if self._on_way:
             self._on_way[-1] = (number, now_ns)
         self.due = self.waits = False
 
     def taken(self, number: int) -> None:
-        """Record that the frames up to this number were received."""
+        """Record that all frames up to this number were received."""
         while self._on_way and self._on_way[0][0] <= number:
             self._on_way.popleft()
 
@@ -92,7 +92,7 @@ class FramePublisher:
     """Publishes the frames of all of a server's cameras. Thread-safe; copies, encodes and sends outside its lock."""
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
-        #: Returns why a topic can't be subscribed to, or an empty string if it can be.
+        #: Returns why a topic can't be subscribed to, or an empty string if it can.
         self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send
         self._name = name
@@ -105,9 +105,9 @@ class FramePublisher:
         self._unable: set[str] = set()  # topics whose encoding failed and has been logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Publish a frame; return the number of readers that miss it because they have :data:`WINDOW` frames in flight.
+        """Publish a frame. Return the number of readers that miss it because they have :data:`WINDOW` frames in flight.
 
-        If the camera has readers, copy the pixels; the camera's thread encodes and sends them.
+        If the camera has readers, copy the pixels. The camera's thread then encodes and sends them.
         """
         variants = self._variants.get(header.camera)
         if not variants:
@@ -141,7 +141,7 @@ class FramePublisher:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """Send frames to a connection, starting with the next one. Return False if that fails (see :meth:`problem`)."""
+        """Send frames to a connection from the next frame on. Return False if that fails (see :meth:`problem`)."""
         with self._changed:
             if self._problem(key, topic):
                 return False
@@ -200,7 +200,7 @@ class FramePublisher:
                     self._drop(camera, topic, key)
 
     def taken(self, key: Hashable, topic: str, number: int) -> None:
-        """Record up to which frame a connection has received a topic. If it has missed one, send it the newest."""
+        """Record up to which frame a connection has received a topic. If it missed a frame, send it the newest one."""
         with self._changed:
             for variants in self._variants.values():
                 variant = variants.get(topic)
@@ -232,7 +232,7 @@ class FramePublisher:
                 del self._variants[camera]
                 self._changed.notify_all()
 
-    # --- a camera's thread ---
+    # --- on a camera's thread ---
 
     def _run(self, camera: str) -> None:
         while (work := self._next(camera)) is not None:
@@ -259,14 +259,14 @@ class FramePublisher:
                     now_ns = self._clock()
                     for key in due:
                         variant.readers[key].sent(picture.number, now_ns)
-                    variants[topic] = variants.pop(topic)  # next time, the others come first
+                    variants[topic] = variants.pop(topic)  # next time, the other variants come first
                     return variant, picture, None if len(due) == len(variant.readers) else due
                 self._changed.wait()
             self._threads.pop(camera, None)
         return None
 
     def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
-        """Encode a frame as requested; if that fails, return it unencoded and log the failure once."""
+        """Encode a frame as requested. If that fails, return the frame unencoded and log the failure once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)
         except (MissingExtraError, LinkError) as error:

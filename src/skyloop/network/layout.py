@@ -1,10 +1,10 @@
 """The keys of the fabric transport: the key for each packet, and the keys that each role may use. Pure functions.
 
-A packet that requests something must travel by the matching key, so controlling keys means controlling actions.
+A packet that requests something must travel by the matching key. Controlling keys therefore means controlling actions.
 
-``docs/wire-format.md`` has the table. NAME is a proxy's name, WHO an application's identity (the common name of its
-certificate, ``anyone`` without keys), ID a connection (16 random hexadecimal digits). TOPIC, CAMERA and VARIANT may be
-arbitrary text, so each is percent-encoded to one chunk of a key.
+``docs/wire-format.md`` contains the table. NAME is a proxy's name. WHO is an application's identity: the common name of
+its certificate, or ``anyone`` without keys. ID is a connection (16 random hexadecimal digits). TOPIC, CAMERA and
+VARIANT may be arbitrary text, so each is percent-encoded to one chunk of a key.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ from skyloop.transport.base import FEEDBACK, NAME
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO if there are no keys
-PLAIN: Final = "-"  #: the variant with a camera's unchanged frames
+PLAIN: Final = "-"  #: the variant that contains a camera's unchanged frames
 #: Valid identities: one chunk of a key, without wildcards.
 WHO: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 ID: Final = re.compile(r"[0-9a-f]{16}")
 
-# Kinds of keys for an application's packets, the kind with the weakest right first.
+# Kinds of keys for an application's packets, weakest right first.
 ASK: Final = "ask"  #: reliable; also for observers
 ORDER: Final = "order"  #: reliable; only for pilots
-COMMAND: Final = "command"  #: best effort; the command channel
+COMMAND: Final = "command"  #: best effort; the channel for commands
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: Requests that observers may send. Any other needs the right to order, so that new kinds are safe by default.
+#: Requests that observers may send. Any other kind needs the right to order, so that new kinds are safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, because garbage must stay in order
-_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need these to fly
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, so that garbage keeps its place in the order
+_POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need poses to fly
 
 
 class Sender(NamedTuple):
@@ -100,7 +100,7 @@ def topic(name: str, topic_name: str) -> str:
 
 
 def newest_wins(topic_name: str) -> bool:
-    """Return whether only a topic's newest packet counts, so that it may be lost and never waits for earlier ones."""
+    """Return whether only a topic's newest packet matters. Such a packet may be lost, and never waits for others."""
     return topic_name.partition("?")[0] == FEEDBACK  # feedback in any variant
 
 
@@ -110,12 +110,12 @@ def video(name: str, camera: str, variant: str = "") -> str:
 
 
 def video_for(name: str, camera: str, variant: str, connection: str) -> str:
-    """Return the key for frames to one application, used while another reader of the variant can't keep up."""
+    """Return the key for frames to one application. It is used while another reader of the variant can't keep up."""
     return f"{video(name, camera, variant)}/{connection}"
 
 
 def downward(name: str) -> tuple[str, str, str]:
-    """Return expressions for all keys by which a proxy sends packets and frames."""
+    """Return expressions for all keys that a proxy uses to send packets and frames."""
     return to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"
 
 
@@ -136,12 +136,12 @@ def parse_alive(key: str) -> tuple[str, str]:
 
 
 def parse_topic(key: str) -> str:
-    """Return the topic from a key made by :func:`topic`."""
+    """Return the topic for which :func:`topic` made a key."""
     return unquote(key.rpartition("/")[2])
 
 
 def check_identity(who: str) -> None:
-    """Check that an identity can be used as WHO."""
+    """Check that an identity is a valid WHO."""
     if not WHO.fullmatch(who):
         raise UsageError(
             f"{who!r} cannot be an identity: 1 to 64 letters, digits, '_', '-' and '.', the first one a letter or digit"
@@ -154,7 +154,7 @@ def check_identity(who: str) -> None:
 def way_of(packet: bytes) -> str:
     """Return the kind of key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
 
-    Bytes that are not a packet need no rights, because nothing acts on them.
+    Bytes that are not a packet need no rights, because they have no effect.
     """
     kind = packet[5:6]
     if kind == _COMMAND:
@@ -171,12 +171,12 @@ def way_of(packet: bytes) -> str:
 
 
 def is_report(packet: bytes) -> bool:
-    """Return whether a packet reports a stream's state; such a packet may be lost, and is wrong once it is late."""
+    """Return whether a packet reports a stream's state. It may be lost, because a late report would be wrong."""
     return packet[:6] == _REPORT
 
 
 def allows(way: str, packet: bytes) -> bool:
-    """Return whether a packet is allowed on the key on which it arrived."""
+    """Return whether a packet is allowed on the key that it arrived on."""
     return WAYS.index(way) >= WAYS.index(way_of(packet))
 
 

@@ -29,35 +29,35 @@ class FabricKind(IntEnum):
     """Kinds of packets that the transport's two ends exchange."""
 
     SUBSCRIBE = 0x50  #: application to proxy
-    TAKEN = 0x51  #: either direction: packets up to this number were received
+    TAKEN = 0x51  #: either direction: all packets up to this number were received
     SEEN = 0x52  #: application to proxy: frames up to this number were received
-    BYE = 0x53  #: either direction: why the connection ends; answered with a BYE
+    BYE = 0x53  #: either direction: the reason why the connection ends; answered with a BYE
     KEY = 0x54  #: proxy to application, sealed: the new key for topics and frames
 
 
 class Subscribe(NamedTuple):
-    """Subscribes an application to a topic, or unsubscribes it."""
+    """Subscribes an application to a topic, or ends the subscription."""
 
     topic: str
     on: bool
 
 
 class Taken(NamedTuple):
-    """Acknowledges packets up to a number."""
+    """Acknowledges all packets up to a number."""
 
     topic: str  #: empty for packets sent to this end only
     number: int
 
 
 class Seen(NamedTuple):
-    """Acknowledges frames of a topic up to a number."""
+    """Acknowledges all frames of a topic up to a number."""
 
     topic: str
     number: int
 
 
 class Bye(NamedTuple):
-    """The reason for which the connection ends."""
+    """The reason why the connection ends."""
 
     reason: str
 
@@ -84,7 +84,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     """An application's request to join, as MessagePack."""
 
     revision: int
-    run: str  #: run of the proxy that the request is meant for
+    run: str  #: the run of the proxy that the request is meant for
     host: str = ""  #: shown to users
     pid: int = 0  #: shown to users
     program: str = ""  #: shown to users
@@ -101,11 +101,11 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True):
 
 
 class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
-    """A proxy's description of itself, sent as MessagePack when its ``info`` key is queried."""
+    """A proxy's description of itself. It is sent as MessagePack in reply to queries of the proxy's info key."""
 
     name: str
     run: str
-    since_ns: int  #: wall-clock time when it started [ns since 1970]; the older of two proxies keeps the name
+    since_ns: int  #: wall-clock time when the proxy started [ns since 1970]; the older of two proxies keeps the name
     host: str
     pid: int
     vehicle: str  #: the vehicle's address, e.g. ``sim://``
@@ -119,7 +119,7 @@ decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 
 def is_own(packet: bytes) -> bool:
-    """Return whether a packet may be for the transport itself, rather than for the handler."""
+    """Return whether a packet may be meant for the transport itself rather than for the handler."""
     return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
 
 
@@ -176,7 +176,7 @@ def parse(packet: bytes) -> Message:
 
 
 def parse_own(packet: bytes) -> Message | None:
-    """Decode one of the transport's own packets; return None if it is for the handler or garbage."""
+    """Decode one of the transport's own packets. Return None if the packet is for the handler, or is garbage."""
     if not is_own(packet):
         return None
     try:
@@ -196,7 +196,7 @@ def _topic(text: bytes, least: int = 0) -> str:
 
 
 def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
-    """Return a copy of bytes received by Zenoh, unless they exceed the maximum size; empty for None."""
+    """Return a copy of bytes that Zenoh received, unless they exceed the maximum size; empty for None."""
     if data is None:
         return b""
     if len(data) > at_most:
@@ -205,7 +205,7 @@ def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
 
 
 def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
-    """Return a sample's packet, which must not be empty or too large, and its attachment."""
+    """Return the packet in a sample, which must not be empty or too large, and its attachment."""
     if not sample.payload:
         raise DecodeError("it is empty")
     return copied(sample.payload, at_most), copied(sample.attachment, MAX_OWN)
@@ -213,7 +213,7 @@ def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, by
 
 # Attachments ---------------------------------------------------------------------------------------------------
 
-#: Attachment of a packet sent to one end: its number, from 1; 0 for the transport's own packets, which are not counted.
+#: Attachment of a packet sent to one end: the packet's number, from 1. The transport's own packets all have number 0.
 number = _NUMBER.pack
 
 

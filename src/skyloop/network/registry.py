@@ -1,6 +1,6 @@
-"""Keep a proxy's connections: admit applications and end connections.
+"""Manage a proxy's connections: admit applications and end connections.
 
-A connection is ended if its application is gone, has lost its rights, or acknowledges nothing.
+A connection is ended if its application has ended, has lost its rights, or acknowledges nothing.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from skyloop.network.keys import KeyRing
 
 CONFIRM_S: Final = 3.0  #: time for an admitted application to declare its token
-#: Disconnect an application that acknowledges nothing for this long. Its transport acknowledges at once, no matter how
-#: slow the application's own code is.
+#: Disconnect an application that acknowledges nothing for this long. The application's transport acknowledges at once,
+#: no matter how slow the application's own code is.
 STALLED_S: Final = 3.0
 _SHUT_OUT: Final = "its key was revoked, or its rights were changed"
 
@@ -38,15 +38,15 @@ T = TypeVar("T")
 #: requesting authority.
 IN_A_ROW: Final = 16
 
-#: Items for the thread that calls the handler: a packet, True for joined, or False for left.
+#: Items for the thread that calls the handler: a packet, True if the application has joined, or False if it has left.
 Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
     """The connections of one transport server. Thread-safe, except for :meth:`check`.
 
-    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: time to wait beyond :data:`STALLED_S` before
-    disconnecting a silent application [s].
+    Without keys, ``ring`` and ``topic_keys`` are None. ``excused_s``: additional time to wait, beyond
+    :data:`STALLED_S`, before a silent application is disconnected [s].
     """
 
     def __init__(
@@ -74,14 +74,14 @@ class ConnectionRegistry:
         self._tokens = Tokens(by_key=ring is not None)  # tokens of live connections
         self._connections: dict[str, ServerConnection] = {}
         self._peers: dict[int, ServerConnection] = {}
-        self._left = threading.Condition()  # notified when a connection is gone
+        self._left = threading.Condition()  # notified when a connection has ended
         self._last_id = 0
-        self._shut: frozenset[str] = frozenset()  # identities excluded when the topic key was made
-        self.dropped = 0  #: number of applications disconnected because they acknowledged nothing
-        self.turned_away = 0  #: number of connections and tokens refused because of the limits
-        self._away = ""  # why they were turned away, until the handler has been notified
-        self.strays = 0  #: number of samples and queries without a connection
-        self._stray_commands = 0  # number of commands and requests among them, not yet reported to the handler
+        self._shut: frozenset[str] = frozenset()  # identities that were excluded when the topic key was made
+        self.dropped = 0  #: number of applications that were disconnected because they acknowledged nothing
+        self.turned_away = 0  #: number of connections and tokens that were refused because of the limits
+        self._away = ""  # why connections were turned away, until the handler has been notified
+        self.strays = 0  #: number of samples and queries that belong to no connection
+        self._stray_commands = 0  # number of commands and requests among those packets, not yet reported to the handler
 
     def open(self) -> None:
         """Start admitting applications."""
@@ -101,7 +101,7 @@ class ConnectionRegistry:
 
     @property
     def connections(self) -> list[ServerConnection]:
-        """The current connections, as a copy."""
+        """A copy of the current connections."""
         return list(self._connections.values())
 
     def of_peer(self, peer: Peer) -> ServerConnection | None:
@@ -109,29 +109,29 @@ class ConnectionRegistry:
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
-        """Return the connection that a key belongs to; :class:`DecodeError` if none has this id and identity."""
+        """Return the connection that a key belongs to. Raises :class:`DecodeError` if none has this id and identity."""
         connection = self._connections.get(sender.id)
         if connection is None or connection.who != sender.who:
             raise DecodeError("it is not connected")
         return connection
 
     def is_shut_out(self, connection: ServerConnection) -> bool:
-        """Return whether a newer roster excludes the key of a connection; if so, end the connection."""
+        """Return whether a newer roster excludes the key of a connection. If one does, end the connection."""
         if self._ring is None or connection.who not in self._ring.shut_out:
             return False
         self._shut_out(connection, _SHUT_OUT)
         return True
 
     def stray(self, key: str) -> None:
-        """Count a packet without a connection, given the key on which it arrived."""
+        """Count a packet without a connection, given the key that it arrived on."""
         self.strays += 1
-        if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive late
+        if f"/{layout.ASK}/" not in key:  # an application's last packets may arrive after it has left
             self._stray_commands += 1
 
     # --- callbacks, on Zenoh's threads ---
 
     def on_token(self, sample: zenoh.Sample) -> None:
-        """Record that an application's token appeared or disappeared. Called on Zenoh's threads."""
+        """Record that an application's token has appeared or disappeared. Called on Zenoh's threads."""
         try:
             sender = layout.parse_sender(str(sample.key_expr))
         except DecodeError:
@@ -160,7 +160,7 @@ class ConnectionRegistry:
                 self.strays += 1
                 return
             if request.run != self._run:
-                return  # meant for another proxy with this name
+                return  # intended for another proxy with this name
             try:
                 admission = self._admit(sender, request)
                 problem = self._join(sender, request, admission)
@@ -182,14 +182,14 @@ class ConnectionRegistry:
         return admit(self._ring, self._name, self._run, sender, request, newest)
 
     def _join(self, sender: layout.Sender, request: packets.Join, admission: Admission) -> str:
-        """Admit an application; return why it was refused, or an empty string."""
+        """Admit an application. Return why it was refused, or an empty string."""
         if request.revision != packets.REVISION:
             return f"it uses revision {request.revision} of the fabric transport, this proxy {packets.REVISION}"
         with self._lock:
             if not self._open:
                 return "the proxy is about to stop"
             if sender.id in self._connections:
-                before = self._connections[sender.id]  # the request was repeated, or arrived on two paths
+                before = self._connections[sender.id]  # the request was repeated, or arrived by two paths
                 same = before.who == sender.who and before.admission.offer == request.proof
                 return "" if same else "its number is taken"
             address = f"{sender.who} at {request.host[:64] or '?'}"
@@ -206,7 +206,7 @@ class ConnectionRegistry:
         return ""
 
     def _no_place(self, who: str) -> str:
-        """Return why there is no room for another connection; without keys, only the total number is limited."""
+        """Return why there is no room for another connection. Without keys, only the total number is limited."""
         if self._ring is None:
             full = len(self._connections) >= MAX_CLIENTS
             return f"fabric:{self._name} already has its maximum of {MAX_CLIENTS} connections" if full else ""
@@ -246,7 +246,7 @@ class ConnectionRegistry:
     def _check_keys(self) -> None:
         """End connections whose keys have been excluded or have expired.
 
-        If there were any, create a new key for published packets, so that they can no longer read them.
+        If there were any, create a new key for published packets, which the excluded applications can't read.
         """
         ring, keys = self._ring, self._topic_keys
         if ring is None or keys is None:
@@ -278,7 +278,7 @@ class ConnectionRegistry:
     # --- sending to one connection, and ending it: any thread ---
 
     def send(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Send a packet that must arrive. Return False if the connection has ended or ends here. Any thread."""
+        """Send a packet that must arrive. Return False if the connection has ended, or ends now. Any thread."""
         if connection.ended:
             return False
         if problem := connection.queue(packet):
@@ -300,7 +300,7 @@ class ConnectionRegistry:
     def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
         """Disconnect an application and drop its unhandled packets. Any thread.
 
-        With ``forget=False``, the connection is removed when the application answers or its token disappears.
+        With ``forget=False``, the connection is removed only when the application answers or its token disappears.
         """
         self._hang_up(connection, reason)
         connection.ended = True
@@ -320,7 +320,7 @@ class ConnectionRegistry:
             self._left.notify_all()
 
     def _shut_out(self, connection: ServerConnection, reason: str) -> None:
-        """Disconnect an application, but still handle its earlier packets."""
+        """Disconnect an application. Packets that it sent earlier are still handled."""
         self._hang_up(connection, reason)
         self.end(connection, reason)
 
@@ -334,7 +334,7 @@ class ConnectionRegistry:
 
 
 class _TurnQueue(Generic[T]):
-    """One queue per connection; the connections take turns, so that one with many items doesn't delay the others."""
+    """One queue per connection. The connections take turns, so that one with many items doesn't delay others."""
 
     def __init__(self) -> None:
         self._order: deque[Hashable] = deque()
@@ -366,7 +366,7 @@ class _TurnQueue(Generic[T]):
 
 
 class HandlerQueue(Generic[T]):
-    """The queue for the thread that calls a handler: commands come first, and connections take turns.
+    """The queue of packets for the thread that calls a handler. Commands come first, and connections take turns.
 
     Items of equal urgency from one connection stay in order.
     """
@@ -379,7 +379,7 @@ class HandlerQueue(Generic[T]):
         self._closed = False
 
     def put(self, of: Hashable, item: T, *, urgent: bool = False, at_most: int | None = None) -> bool:
-        """Queue a connection's item, urgent ones first; refuse it if ``at_most`` are waiting. Any thread."""
+        """Queue a connection's item, urgent items first. Refuse it if ``at_most`` are waiting. Any thread."""
         with self._changed:
             queue = self._urgent if urgent else self._others
             if at_most is not None and queue.count(of) >= at_most:
@@ -389,18 +389,18 @@ class HandlerQueue(Generic[T]):
             return True
 
     def waiting(self, of: Hashable) -> int:
-        """Return how many of a connection's non-urgent items are queued."""
+        """Return how many of a connection's queued items are not urgent."""
         with self._changed:
             return self._others.count(of)
 
     def close(self) -> None:
-        """Stop :meth:`get` from waiting; it still returns items already queued."""
+        """Stop :meth:`get` from waiting. Items that are already queued are still returned."""
         with self._changed:
             self._closed = True
             self._changed.notify()
 
     def get(self, timeout_s: float) -> T | None:
-        """Return the next item, or None after the time-out or if the queue is closed and empty."""
+        """Return the next item; None after the time-out, or if the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
             if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):
@@ -411,6 +411,6 @@ class HandlerQueue(Generic[T]):
 
     @property
     def over(self) -> bool:
-        """Whether the queue is closed and empty."""
+        """Whether the queue is closed and contains no more items."""
         with self._changed:
             return self._closed and not self._urgent and not self._others

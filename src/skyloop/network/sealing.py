@@ -1,7 +1,7 @@
 """Seal packets end to end: no node between a proxy and its applications can read, change or replay them.
 
-The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates a packet's attachment and the key it travels by.
-Without keys nothing is sealed. ``docs/wire-format.md`` describes the bytes.
+The seal is ChaCha20-Poly1305 (RFC 8439). The seal also authenticates a packet's attachment and the key it travels by.
+Without keys, nothing is sealed. ``docs/wire-format.md`` describes the bytes.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     import zenoh
     from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
-TAG: Final = 16  #: bytes that sealing adds to a payload
-_TRAILER = struct.Struct("<IQ")  # generation and number: appended to the attachment, and used as the nonce
+TAG: Final = 16  #: number of bytes that sealing adds to a payload
+_TRAILER = struct.Struct("<IQ")  # generation and number; they are appended to the attachment, and used as the nonce
 TRAILER: Final = _TRAILER.size
 KEY_BYTES: Final = 32
-#: How many packets late a packet may arrive: datagrams can overtake resent packets, 100 a second for 10 s.
+#: Number of packets by which a packet may arrive late. Datagrams can overtake resent packets, 100 a second for 10 s.
 WIDTH: Final = 1024
-GENERATIONS: Final = 3  #: topic keys that an application keeps: the one in use, the newest, and one between them
-#: Delay between sending a new topic key and first using it, so that it arrives before the first packet sealed with it.
+GENERATIONS: Final = 3  #: topic keys that an application keeps: the current one, the newest one, and one between
+#: Delay between sending a new topic key and first using it, so that it arrives before the packets sealed with it.
 SWITCH_S: Final = 0.5
 
 
 class Plain:
-    """Seal and opener for use without keys; they change nothing."""
+    """A seal and opener that change nothing, for use without keys."""
 
     tag = trailer = 0
 
@@ -52,7 +52,7 @@ PLAIN: Final = Plain()
 
 
 class Seal:
-    """Seals with a numbered key of :data:`KEY_BYTES` bytes, and never uses a packet number twice."""
+    """Seals packets with a numbered key of :data:`KEY_BYTES` bytes, and never uses a packet number twice."""
 
     def __init__(self, key: bytes, generation: int = 0) -> None:
         self.key = key
@@ -68,23 +68,23 @@ class Seal:
 
 
 class Open:
-    """Opens packets sealed by the other end's :class:`Seal`, each only once. Any thread."""
+    """Opens packets that the other end's :class:`Seal` sealed, each only once. Any thread."""
 
     tag = TAG  #: bytes that sealing adds to a payload
-    trailer = TRAILER  #: bytes that sealing adds to an attachment
+    trailer = TRAILER  #: number of bytes that sealing adds to an attachment
 
     def __init__(self) -> None:
         self._ciphers: dict[int, ChaCha20Poly1305] = {}
-        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only for keys that have opened an authentic packet
+        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only keys that have opened an authentic packet
 
     def use(self, key: bytes, generation: int = 0) -> Open:
-        """Also open packets sealed with this key. Only the newest :data:`GENERATIONS` keys are kept."""
+        """Also open packets that were sealed with this key. Only the newest :data:`GENERATIONS` keys are kept."""
         self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
         self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
         return self
 
     def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
-        """Return the packet and its attachment, or None if it is a repeat or can't be opened yet.
+        """Return the packet and its attachment; None if the packet is a repeat or can't be opened yet.
 
         Raises :class:`DecodeError` if the packet did not come from the other end.
         """
@@ -108,7 +108,7 @@ class Open:
 
 
 def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
-    """Open a sample like :meth:`Open.open`, but don't copy one that is too large, and refuse one that is empty."""
+    """Open a sample like :meth:`Open.open`, but don't copy a sample that is too large, and refuse an empty one."""
     payload, attachment = packets.contents(sample, MAX_PACKET + opener.tag)
     opened = opener.open(str(sample.key_expr), attachment, payload)
     if opened is not None and not 0 < len(opened[0]) <= MAX_PACKET:
@@ -119,12 +119,12 @@ def contents(opener: Plain | Open, sample: zenoh.Sample) -> tuple[bytes, bytes] 
 class ReplayWindow:
     """Keeps track of the numbers received, as in IPsec (RFC 4303).
 
-    Each number is new only once; a number :data:`WIDTH` or more behind the newest is never new. Thread-safe.
+    Each number is new only once. A number that is :data:`WIDTH` or more behind the newest is never new. Thread-safe.
     """
 
     def __init__(self) -> None:
         self._newest = 0
-        self._seen = 0  # one bit per number, from the newest one down
+        self._seen = 0  # one bit per number, from the newest number down
         self._lock = threading.Lock()
 
     def is_new(self, number: int) -> bool:
@@ -142,7 +142,7 @@ class ReplayWindow:
 
 
 class TopicSeal:
-    """Seals packets for all of a proxy's applications, with a key that changes when one of them is excluded."""
+    """Seals packets for all of a proxy's applications. The key changes when an application is excluded."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -151,10 +151,10 @@ class TopicSeal:
         self._since = 0.0
 
     def renew(self) -> None:
-        """Create a new key, :attr:`newest`, for all remaining applications; it takes effect after :data:`SWITCH_S`.
+        """Create a new key, :attr:`newest`, for all remaining applications. It takes effect after :data:`SWITCH_S`.
 
-        A pending switch is not delayed by another one, because otherwise the first excluded application could go on
-        reading. The remaining ones may therefore miss packets until the newer key arrives.
+        A pending switch is not delayed by another one, because otherwise the application that was excluded first could
+        continue to read. Applications that stay may therefore miss packets until the newer key arrives.
         """
         if self._in_use is self.newest:
             self._since = self._clock() + SWITCH_S
@@ -168,7 +168,7 @@ class TopicSeal:
 
 
 def _cipher(key: bytes) -> ChaCha20Poly1305:
-    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # imported only if there are keys
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # imported only if keys are used
 
     return ChaCha20Poly1305(key)
 
@@ -180,9 +180,9 @@ def _forged() -> type[Exception]:
 
 
 def _bound(where: str, attachment: bytes) -> bytes:
-    """Return the bytes that are authenticated along with the data.
+    """Return the bytes that are authenticated along with the payload.
 
-    Keys contain no zero byte, so nothing can be shifted from one part to the other.
+    Keys contain no zero byte, so no byte can be shifted from one part to the other.
     """
     return where.encode() + b"\0" + attachment
 

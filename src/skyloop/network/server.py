@@ -1,8 +1,8 @@
 """The proxy's end of the fabric transport.
 
 Zenoh's threads only sort incoming packets. A separate thread calls the handler, commands first, so that a slow handler
-does not delay signs of life. A third thread sends to individual applications, so that an application that acknowledges
-nothing does not delay the handler. Sending never blocks on an application.
+does not delay keep-alive packets. A third thread sends to individual applications, so that an application that
+acknowledges nothing does not delay the handler. Sending never blocks on an application.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from skyloop.transport.priority import SUPERSEDED, is_command
 if TYPE_CHECKING:
     import zenoh
 
-FAREWELL_S: Final = 0.5  #: time that applications get to receive the reason when a transport server stops
+FAREWELL_S: Final = 0.5  #: time for applications to receive the reason when a transport server stops
 _POLL_S: Final = 0.5  # interval between checks of the connections
-_REFUSED: Final = b""  # represents a refused packet
-_COMMAND: Final = b"c"  # represents a command: the first one in the connection's backlog
+_REFUSED: Final = b""  # represents a packet that was refused
+_COMMAND: Final = b"c"  # represents a command: the first command in the connection's backlog
 _log = logging.getLogger(__name__)
 
 
@@ -55,7 +55,7 @@ class FabricServer(TransportServer):
         ring = self._settings.ring
         topic_keys = None if ring is None else TopicSeal()
         self._commands_lock = threading.Lock()  # guards the connections' backlogs of commands
-        self._superseded = 0  # number of queued commands that newer ones have superseded
+        self._superseded = 0  # number of queued commands that newer commands have superseded
         self._queue: HandlerQueue[Item] = HandlerQueue()
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
@@ -75,7 +75,7 @@ class FabricServer(TransportServer):
         self._session: Session | None = None
         self._declared: list[Any] = []
         self._thread: threading.Thread | None = None
-        self.refused = 0  #: number of packets not allowed on their key
+        self.refused = 0  #: number of packets that were not allowed on their key
 
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
@@ -149,7 +149,7 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; for a camera's plain topic, include those to all its formats."""
+        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -213,7 +213,7 @@ class FabricServer(TransportServer):
                 return
             opened = contents(connection.admission.opener, sample)
             if opened is None:
-                return  # already received on another path
+                return  # the packet was already received by another path
             packet, attachment = opened
             number = packets.parse_number(attachment)
         except DecodeError:
@@ -249,11 +249,11 @@ class FabricServer(TransportServer):
                 return
             superseded = connection.commands.put(packet)
             self._superseded += superseded
-        if not superseded:  # otherwise the packet takes the turn of the one it replaces
+        if not superseded:  # otherwise the packet takes the turn of the packet that it replaces
             self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
-        """Handle one of the transport's own packets; return False if it is left to the handler (garbage)."""
+        """Handle one of the transport's own packets. Return False if the handler must handle the packet (garbage)."""
         if isinstance(message, packets.Taken):
             if connection.took(message.topic, message.number, time.monotonic()):
                 self._sender.wake(connection)
@@ -268,7 +268,7 @@ class FabricServer(TransportServer):
             self._registry.end(connection, message.reason)
         return True
 
-    # --- the thread that calls the handler ---
+    # --- on the thread that calls the handler ---
 
     def _serve(self, handler: ServerHandler) -> None:
         checked = time.monotonic()
@@ -296,7 +296,7 @@ class FabricServer(TransportServer):
                     if what is _COMMAND:
                         with self._commands_lock:
                             if not connection.commands:
-                                continue  # one command superseded two
+                                continue  # one command superseded two commands
                             what = connection.commands.get()
                     self._handle(handler, connection, what)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
@@ -308,12 +308,12 @@ class FabricServer(TransportServer):
             handler.refused(connection.peer, "it sent a packet that its keys do not allow")
             return
         message = packets.parse_own(packet)
-        if isinstance(message, packets.Subscribe):  # subscribing had failed
+        if isinstance(message, packets.Subscribe):  # the earlier subscription had failed
             handler.malformed(connection.peer, self._publisher.problem(connection, message.topic))
         else:
             handler.packet(connection.peer, packet)
 
 
 def beside(local: TransportServer, name: str, settings: FabricSettings, vehicle: str) -> TransportServer:
-    """Return a proxy's end for both this host and the network; other arguments are those of :class:`FabricServer`."""
+    """Return a proxy's end for both this host and the network. The other arguments are :class:`FabricServer`'s."""
     return CompositeServer([local, FabricServer(name, settings, vehicle=vehicle)])

@@ -1,4 +1,4 @@
-"""This process's Zenoh sessions: connections with the same settings share one, for any number of drones."""
+"""This process's Zenoh sessions. Connections with the same settings share one, for any number of drones."""
 
 from __future__ import annotations
 
@@ -22,45 +22,45 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = 2.0  #: an unused session stays open this long for clients that reconnect
+LINGER_S: Final = 2.0  #: an unused session stays open this long, in case clients reconnect
 REOPEN_S: Final = 2.0  #: time to wait for an address to become free again
 CLOSE_S: Final = 5.0  #: time that the process waits at exit for a session to close
 _BORROWED: Final = 1000  # number of retries when another thread is using the object …
 _BORROWED_S: Final = 0.001  # … and the pause between them
-#: Parts of Zenoh's error texts: positions in its source code, and what it adds to an endpoint's address.
+#: Parts of Zenoh's error texts: positions in its source code, and text that it adds to an endpoint's address.
 _PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
 _ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
-_ATTEMPTS: Final = 5  # attempts to get a free port before another process takes it
-Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: Zenoh's priorities in use, highest first
+_ATTEMPTS: Final = 5  # number of attempts to get a free port before another process takes it
+Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: the Zenoh priorities in use, highest first
 
 
 class Session:
-    """A shared Zenoh session; give it back with :func:`release`."""
+    """A shared Zenoh session. Give it back with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
         self.part = part
         self.users = 0
-        self.retired = False  #: not given to new users, because there is a better one
+        self.retired = False  #: not given to new users, because there is a better session
         self.idle_since = 0.0
         self.opened = time.monotonic()
-        self.listens: list[str] = []  #: addresses it listens on
+        self.listens: list[str] = []  #: network addresses that it listens on
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """Wrap a function that Zenoh calls on its thread for each sample, reply or query; it must return quickly."""
+        """Wrap a function that Zenoh calls on its thread for each sample, reply or query. It must return quickly."""
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
 
     def put(self, key: str, payload: bytes, attachment: bytes, priority: Priority) -> None:
-        """Send a packet; it is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
+        """Send a packet. It is dropped if the path is congested. Raises Zenoh's error if the session is closed."""
         z = load()
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
         self.zenoh.put(key, payload, attachment=attachment, congestion_control=drop, priority=level, express=True)
 
     def publisher(self, key: str, priority: Priority, *, best_effort: bool) -> zenoh.Publisher:
-        """Declare a publisher; packets are dropped if the path is congested and, with ``best_effort``, never resent."""
+        """Declare a publisher. Packets are dropped if the path is congested, and never resent with ``best_effort``."""
         z = load()
         reliability = z.Reliability.BEST_EFFORT if best_effort else z.Reliability.RELIABLE
         drop, level = z.CongestionControl.DROP, getattr(z.Priority, priority)
@@ -69,7 +69,7 @@ class Session:
         )
 
     def peers(self) -> set[str]:
-        """Return the common names in the certificates of all linked nodes; empty without keys."""
+        """Return the common names in the certificates of all linked nodes; an empty set without keys."""
         try:
             return {link.auth_identifier or "" for link in self.zenoh.info.links()} - {""}
         except load().ZError:  # the session is closed
@@ -81,7 +81,7 @@ class Session:
         return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
 
     def over(self, now: float) -> bool:
-        """Return whether the session has been unused for long enough to close it. For use by the pool."""
+        """Return whether the session has been unused for long enough to close it. Called only by the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
@@ -100,25 +100,25 @@ class Session:
             try:
                 return zenoh_module.open(configure(sections))
             except zenoh_module.ZError as error:
-                # Another process may have taken the free port; only in that case can another attempt help.
+                # Another process may have taken the free port. Only in that case can another attempt help.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
                     raise LinkError(f"cannot join the network: {reason_of(error)}") from None
         raise AssertionError("unreachable")
 
 
 def reason_of(error: BaseException) -> str:
-    """Return the text of a Zenoh error, without positions in its source code and the internal form of endpoints."""
+    """Return the text of a Zenoh error, without positions in Zenoh's source code and the internal form of endpoints."""
     text = _PLACE.sub("", str(error))
     return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is unknown")
 
 
 class _Pool:
-    """All of this process's sessions. A thread closes unused ones, and ends when there are none."""
+    """All of this process's sessions. A thread closes unused sessions, and ends when none are left."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._sessions: list[Session] = []
-        self._closing = 0  # number of sessions that are being closed and no longer in the list
+        self._closing = 0  # number of sessions that are being closed and are no longer in the list
         self._over = False  # the process is exiting
         self._reaper: threading.Thread | None = None
 
@@ -138,7 +138,7 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back. Once unused, it stays open for :data:`LINGER_S` if it may linger."""
+        """Give a session back. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -153,16 +153,16 @@ class _Pool:
             self._close(session)
 
     def retire(self, session: Session) -> None:
-        """Give new users another session from now on; this one closes once its last user has left."""
+        """Give new users another session from now on. This session closes once its last user has left."""
         with self._changed:
             session.retired = True
 
     def close_all(self) -> None:
         """Close all sessions when the process ends.
 
-        Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh: on
-        returning to Python, such a thread would be ended by an exception that can't pass through native code, which
-        aborts the process ("FATAL: exception not rethrown").
+        Zenoh's threads must not call into an interpreter that is gone, and none of our threads may be inside Zenoh.
+        When such a thread returns to Python, an exception ends it. That exception can't pass through native code, so
+        the process would abort ("FATAL: exception not rethrown").
         """
         with self._changed:
             self._over = True
@@ -173,12 +173,12 @@ class _Pool:
             self._changed.wait_for(lambda: not self._closing, CLOSE_S)
 
     def _take_out(self, session: Session) -> None:
-        """Start closing a session, with the lock held. The caller must then call :meth:`_close`."""
+        """Start closing a session. The caller holds the lock. The caller must then call :meth:`_close`."""
         self._sessions.remove(session)
         self._closing += 1
 
     def _close(self, session: Session) -> None:
-        """Close a session outside the lock, because it may wait for the network."""
+        """Close a session outside the lock, because closing may wait for the network."""
         try:
             session.close()
         finally:
@@ -217,7 +217,7 @@ atexit.register(_close_all, os.getpid())
 
 
 def load() -> Any:
-    """Import the package zenoh and return it; without it, raise :class:`MissingExtraError`."""
+    """Import the package ``zenoh`` and return it. Raises :class:`MissingExtraError` if it is not installed."""
     try:
         import zenoh
     except ImportError as error:
@@ -231,10 +231,10 @@ def host_name() -> str:
 
 
 def renewed(session: Session) -> Session:
-    """Replace a session that has no other users with one at the same addresses that uses the newest roster.
+    """Replace a session that has no other users with a session at the same addresses that uses the newest roster.
 
-    All its links are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or an address does
-    not become free again within :data:`REOPEN_S`.
+    All links of the session are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or if an
+    address does not become free again within :data:`REOPEN_S`.
     """
     settings = replace(session.settings.current(), listen=tuple(session.listens))
     release(session, linger=False)
@@ -242,22 +242,22 @@ def renewed(session: Session) -> Session:
     while True:
         try:
             return acquire(settings, session.part)
-        except LinkError:  # the ports will become free in a moment
+        except LinkError:  # the ports will soon become free
             if time.monotonic() > deadline:
                 raise
             time.sleep(_BORROWED_S)
 
 
 def undeclare(held: Iterable[Any]) -> None:
-    """Undeclare a session's declarations, last first. Must not be called on Zenoh's threads."""
+    """Undeclare a session's declarations in reverse order. Must not be called on Zenoh's threads."""
     ended: type[Exception] = load().ZError
     for each in reversed([*held]):
         for _ in range(_BORROWED):
             try:
                 each.undeclare()
-            except ended:  # the session has ended, and so have its declarations
+            except ended:  # the session has ended, and its declarations with it
                 break
-            except RuntimeError:  # "Already borrowed": another thread is sending with it
+            except RuntimeError:  # "Already borrowed": another thread is sending with the object
                 time.sleep(_BORROWED_S)
             else:
                 break
@@ -272,7 +272,7 @@ def configure(sections: dict[str, Any]) -> zenoh.Config:
 
 
 def _leaves(path: str, value: Any) -> list[tuple[str, Any]]:
-    """Split sections so that missing values keep their defaults; some can only be set as a whole."""
+    """Split sections so that missing values keep their defaults. Some sections can only be set as a whole."""
     if isinstance(value, dict) and not path.endswith(("access_control", "autoconnect", "gateway", "retry")):
         return [leaf for key, inner in value.items() for leaf in _leaves(f"{path}/{key}" if path else key, inner)]
     return [(path, value)]

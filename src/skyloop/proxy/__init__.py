@@ -1,6 +1,6 @@
 """The proxy for one vehicle: authority, command checks, failsafe ladder, limits, parameters, software autopilot.
 
-The rules are in ``docs/proxy.md``. :class:`Proxy` runs in any process; the command line uses
+``docs/proxy.md`` describes the rules. :class:`Proxy` runs in any process; the command line uses
 :func:`skyloop.proxy.serve.serve`.
 """
 

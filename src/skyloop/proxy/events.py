@@ -1,7 +1,7 @@
 """What a proxy reports about itself: numbered events for all clients, and counters on request.
 
-The publisher comes first, followed by the pure functions that create its input, the event drafts: those about commands,
-failsafe and ownership, then those about the authority.
+The publisher comes first, followed by the pure functions that create the event drafts for it: first those about
+commands, failsafe and ownership, then those about the authority.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from skyloop.zones import THINNEST_M, ZONES, Space
 #: Number of command delays in the distribution, about a minute's worth from one pilot at 32 Hz.
 WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
-REPEAT_NS: Final = NS_PER_S  #: interval at which a continuing event is published again
+REPEAT_NS: Final = NS_PER_S  #: interval at which an event that continues is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
-#: Why a hover or landing is abandoned.
+#: The reasons why a hover or landing is abandoned.
 UNHEARD: Final = f"the vehicle was silent for {seconds(BELIEF_NS):g} s and may be on another flight by now"
 _ENFORCED: Final = "enforced: the vehicle's position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is unknown"
@@ -38,14 +38,14 @@ _log = logging.getLogger(__name__)
 
 
 class Counters:
-    """Counts, and the recent command delays. Each name is counted under a single lock, or by a single thread."""
+    """Counters, and the delays of recent commands. Each name is counted under one lock or on one thread."""
 
     def __init__(self) -> None:
         self.counts: defaultdict[str, int] = defaultdict(int)
         self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: delays of accepted commands, from sending to applying
 
     def snapshot(self, **now: float) -> dict[str, float]:
-        """Return all counters, the distribution of command delays [s], and the caller's additions."""
+        """Return all counters, the distribution of command delays [s], and the counters that the caller adds."""
         values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
         values.update(now)
         delays = sorted(self.delays_ns.copy())
@@ -59,7 +59,7 @@ class Counters:
 
 
 class EventPublisher:
-    """Numbers and publishes the events of one run. Thread-safe; never raises."""
+    """Numbers and publishes the events of one run. Thread-safe. Never raises."""
 
     def __init__(
         self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters, scrub: Callable[[str], str] = str
@@ -74,7 +74,7 @@ class EventPublisher:
         self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
-        self.last: Event | None = None  #: the newest event, not counting applications that connect or disconnect
+        self.last: Event | None = None  #: the newest event that is not an application's connection or disconnection
 
     def publish(
         self,
@@ -94,7 +94,7 @@ class EventPublisher:
             self._send(drafts)
 
     def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
-        """Publish an event that may occur many times a second; ``make`` is called only when it is published."""
+        """Publish an event that may occur many times a second. ``make`` is called only when the event is published."""
         with self._lock:
             if self._repeats.first(key, make):
                 draft = make()
@@ -102,7 +102,7 @@ class EventPublisher:
                 self._send([replace(draft, data={**draft.data, "count": 1})])
 
     def tick(self, now_ns: int) -> None:
-        """Publish how many events were repeated or not delivered. Call several times a second."""
+        """Publish how many events were repeated and how many could not be delivered. Call several times a second."""
         with self._lock:
             for draft, count in self._repeats.due(now_ns):
                 text = f"{draft.text} (and {count} more like it within the last second)"
@@ -111,7 +111,7 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be delivered to slow applications"
                 self._send([EventDraft(EventKind.SAMPLES_LOST, text, data={"count": missed})])
-                self._missed = 0  # if this event is lost, no other event reports that
+                self._missed = 0  # if this event is lost, no other event reports the loss
 
     def _send(self, drafts: Sequence[EventDraft]) -> None:
         """Number events and publish them. The caller holds the lock."""
@@ -145,7 +145,7 @@ class EventPublisher:
 
 @dataclass(slots=True)
 class EventDraft:
-    """An event without its number and time."""
+    """An event that has no number or time yet."""
 
     kind: EventKind
     text: str
@@ -157,7 +157,7 @@ class EventDraft:
 class RepeatedEvents:
     """Decides when to publish events that may occur many times a second: the first at once, then totals once a second.
 
-    A total has the text of the newest event, because the reason for a refusal may change between repeats.
+    A total contains the text of the newest event, because the reason for a refusal may change between repeats.
     """
 
     def __init__(self) -> None:
@@ -174,12 +174,12 @@ class RepeatedEvents:
         return False
 
     def begin(self, key: Hashable, draft: Callable[[], EventDraft], now_ns: int) -> None:
-        """Record that the first event with this key, or a total, was published."""
+        """Record that the first event with this key, or its total, was published."""
         self._published[key] = (now_ns, draft)
         self._counts[key] = 0
 
     def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
-        """Return events repeated in the second since they were last published, with counts; forget the others."""
+        """Return the events repeated in the last second, with counts; forget the others."""
         due: list[tuple[EventDraft, int]] = []
         for key, (published_ns, draft) in list(self._published.items()):
             if now_ns - published_ns < REPEAT_NS:
@@ -194,7 +194,7 @@ class RepeatedEvents:
 
 
 class Episodes:
-    """Keeps track of the limits being touched, so that each is published once, not at every repeat of a set-point."""
+    """Tracks the limits that are being touched, so that each is published once, not for every repeat."""
 
     def __init__(self) -> None:
         self._touched_ns: dict[tuple[str, str], int] = {}
@@ -225,7 +225,7 @@ def clamped_event(name: str, clamp: Clamp) -> EventDraft:
 
 
 def enforcement_event(enforced: bool) -> EventDraft:
-    """Return the event for starting or ceasing to enforce the safety box and zones."""
+    """Return the event for the safety box and zones being enforced, or no longer being enforced."""
     text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
     severity = Severity.INFO if enforced else Severity.WARNING
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
@@ -239,7 +239,7 @@ def thin_zones_event(space: Space) -> EventDraft:
 
 
 def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
-    """Return the event for a jump of the position; ``lands``: whether the vehicle was landing."""
+    """Return the event for a jump of the position. ``lands``: whether the vehicle was landing."""
     what = "keeps landing" if lands else "hovers until a new command"
     text = f"the vehicle's position jumped by {jumped_m:.1f} m: it {what}"
     data: dict[str, Value] = {"reason": "position_jumped", "jumped_m": jumped_m}
@@ -247,13 +247,13 @@ def position_jumped_event(jumped_m: float, *, lands: bool) -> EventDraft:
 
 
 def given_up_event(what: str) -> EventDraft:
-    """Return the event for a hover or landing abandoned because the vehicle was silent."""
+    """Return the event for a hover or landing that was abandoned because the vehicle was silent."""
     text = f"the {what} was abandoned: {UNHEARD}: {'land' if what == 'landing' else 'command'} it again once it is back"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.ERROR, data={"reason": f"{what}_given_up"})
 
 
 def drift_event(drifts: bool) -> EventDraft:
-    """Return the event for the velocity becoming unknown to the software autopilot, or known again."""
+    """Return the event for the software autopilot losing the velocity, or having it again."""
     if not drifts:
         text = "the vehicle's velocity is known again: its drift is corrected"
         return EventDraft(EventKind.VEHICLE_MESSAGE, text, Severity.INFO, data={"reason": "drift", "active": False})
@@ -268,7 +268,7 @@ def emergency_event(name: str) -> EventDraft:
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """Return the event for a failsafe step that began or ended."""
+    """Return the event for the start or end of a failsafe step."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
@@ -288,13 +288,13 @@ def battery_event(low: BatteryLow) -> EventDraft:
 
 
 def taken_event(name: str, action: str, others: str) -> EventDraft:
-    """Return the event for the application ``name`` taking the vehicle; ``others``: what others did with it."""
+    """Return the event for the application ``name`` taking the vehicle. ``others``: what others did with it before."""
     text = f"{name} took the vehicle by {action}: {others}"
     return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
 
 
 def ownership_event(changed: Changed) -> EventDraft:
-    """Return the event for a flight that belongs to others, or to an earlier run."""
+    """Return the event for a flight that is not this proxy's, or that an earlier run began."""
     reason = "others" if changed.whose is Whose.OTHERS else "flight"
     return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})
 
@@ -322,7 +322,7 @@ def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
 def authority_event(
     effect: authority.Effect, sessions: Mapping[int, Named], holder: authority.QueueEntry | None, now_ns: int
 ) -> EventDraft:
-    """Return the event for one change in authority; ``holder``: the holder after all changes."""
+    """Return the event for one change in authority. ``holder``: the holder after all changes."""
     name, severity = name_of(sessions, effect.app_id), Severity.WARNING
     data: dict[str, Value] = {"app_id": effect.app_id}
     if not isinstance(effect, authority.Queued | authority.Declined):

@@ -1,4 +1,4 @@
-"""Execute actions with the driver or, if the vehicle doesn't support them, the software autopilot; fly the return.
+"""Execute actions with the driver or, for actions that the vehicle lacks, the software autopilot; fly the return.
 
 Not thread-safe: the command handler's lock is held during every call. Parameters and external poses bypass this module.
 """
@@ -52,13 +52,13 @@ class ActionExecutor:
         self.why_not = capabilities.why_not
         self.flight = flight
         self.autopilot = autopilot
-        #: Whether the path to a target must be checked, in which case the software autopilot flies there.
+        #: Whether the path to a target must be checked. If so, the software autopilot flies there.
         self.guarded = False
         self._driver = driver
         self._left_to = ""  # the driver's last answer
-        self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears and raises it
+        self.observe_error: Exception | None = None  #: why the driver gave no answer; the tick clears it and raises it
         self._publisher = publisher
-        self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; the reader clears it
+        self.autopilot_refusal = ""  #: why the vehicle refused to continue a software take-off; cleared by the reader
 
     @property
     def state(self) -> FlightState:
@@ -67,7 +67,7 @@ class ActionExecutor:
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies or may fly; without a reported state, it may from the first command on."""
+        """Whether the vehicle flies or may fly. Without a reported state, it may fly after the first command."""
         return self.flight.flies(self.state)
 
     @property
@@ -82,7 +82,7 @@ class ActionExecutor:
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
 
     def observe(self, now_ns: int) -> Changed | None:
-        """Observe the vehicle; if its flight has changed hands, return the change."""
+        """Observe the vehicle, and return the change if its flight has changed hands."""
         try:
             left_to = self._driver.left_to()
             self._left_to = shortened(left_to, MAX_LINK_TEXT // 2) if left_to else ""
@@ -91,13 +91,13 @@ class ActionExecutor:
         return self.flight.observe(self._publisher.reported_state, self._left_to, now_ns, self._shown(now_ns))
 
     def _shown(self, now_ns: int) -> Feedback | None:
-        """Return the newest sample if it shows the current state."""
+        """Return the newest sample if it contains the current state."""
         feedback = self._publisher.feedback_now if self._publisher.link_up else None
         return feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
 
     @property
     def stands(self) -> bool:
-        """Whether the vehicle reports that it is on the ground, even if the software autopilot is about to take off."""
+        """Whether the vehicle reports being on the ground, even if the software autopilot is about to take off."""
         return self._publisher.reported_state is FlightState.LANDED
 
     def stop_autopilot(self) -> None:
@@ -106,10 +106,10 @@ class ActionExecutor:
             self.autopilot.stop("idle")
 
     def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Execute a supported action, and return what was actually applied. Raises the driver's errors.
+        """Execute a supported action, and return the action that was actually applied. Raises the driver's errors.
 
-        ``new``: whether it is an application's new request rather than a repeat. Raises :class:`RefusedError` if the
-        vehicle certainly won't follow in its present state.
+        ``new``: whether it is a new request of the application rather than a repeat. Raises :class:`RefusedError` if
+        the vehicle certainly won't follow commands in its present state.
         """
         autopilot = self.autopilot
         try:
@@ -162,9 +162,9 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover permanently: no further commands are sent.
+        """Hover permanently. No further commands are sent.
 
-        A vehicle without a native hover is also stopped, as far as a single set-point can do that.
+        A vehicle without a native hover is also stopped, as well as a single set-point can do that.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)
@@ -176,7 +176,7 @@ class ActionExecutor:
             self._publisher.driver_failed("failsafe", error)
 
     def step(self, now_ns: int) -> AnyAction | None:
-        """Let the software autopilot, if it is on, send its next set-point; return what the driver applied."""
+        """If the software autopilot is on, let it send its next set-point. Return what the driver applied."""
         if self.autopilot is None:
             return None
         action = self.autopilot.step(now_ns, self._shown(now_ns), self._publisher.reported_state)
@@ -199,16 +199,16 @@ class ActionExecutor:
 
 
 class ReturnSupervisor:
-    """Flies the vehicle back to its start for the failsafe ladder, and provides the related feedback fields."""
+    """Flies the vehicle back to its start for the failsafe ladder, and reports this in feedback."""
 
     def __init__(self, checks: CommandChecks, ladder: FailsafeLadder, executor: ActionExecutor) -> None:
-        self.start: Vec3 | None = None  #: where the vehicle took off, the same as in feedback [m]
-        self.phase = ReturnPhase.NONE  #: progress of the return, the same as in feedback
+        self.start: Vec3 | None = None  #: where the vehicle took off, as reported in feedback [m]
+        self.phase = ReturnPhase.NONE  #: progress of the return, as reported in feedback
         self._checks = checks
         self._ladder = ladder
         self._executor = executor
-        self._problem = ""  # why the ladder's return flight can't continue
-        self._good_ns = 0  # when the return was last able to continue
+        self._problem = ""  # reason why the ladder's return flight can't continue
+        self._good_ns = 0  # last time at which the return could continue
 
     def begin(self, action: ReturnToStart, now_ns: int) -> None:
         """Start the ladder's return; :meth:`update` continues it."""
@@ -216,9 +216,9 @@ class ReturnSupervisor:
         self._problem, self._good_ns = "", now_ns
 
     def update(self, seen: Snapshot, *, ours: bool) -> bool:
-        """Observe the start, and fly back if the ladder requires it; return whether feedback must change.
+        """Update the start position, and fly back if the ladder requires it; return whether feedback must change.
 
-        ``ours``: whether the flight is the proxy's own; a vehicle flown by others does not return on our behalf.
+        ``ours``: whether the flight is the proxy's. Vehicles flown by others do not return on the proxy's behalf.
         """
         checks = self._checks
         checks.start.observe(seen.state, seen.feedback, seen.now_ns)
@@ -236,7 +236,7 @@ class ReturnSupervisor:
         return (self.start, self.phase) != before
 
     def why_not(self, seen: Snapshot) -> str:
-        """Return why the ladder can't fly back to the start; empty if it can, or does not need to."""
+        """Return why the ladder can't fly back to the start; empty if it can or does not need to."""
         settings = self._ladder.settings
         if self._ladder.returning:
             return self._problem
@@ -247,7 +247,7 @@ class ReturnSupervisor:
         return self._checks.why_no_return(seen.feedback, seen.now_ns)
 
     def _fly(self, seen: Snapshot) -> None:
-        """Take the next step of the ladder's return; the ladder handles objections."""
+        """Take the next step of the ladder's return to the start. The ladder handles any objections."""
         now_ns = seen.now_ns
         if not seen.link_up:
             self._good_ns = now_ns  # nothing is known, so there is no objection

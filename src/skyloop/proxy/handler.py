@@ -1,4 +1,4 @@
-"""The command handler, which executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
+"""The command handler. It executes applications' requests under the lock of :mod:`skyloop.proxy.supervision`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from skyloop.proxy.supervision import SLEEP_NS, FlightSupervisor
 from skyloop.transport.base import COMMANDS
 
 _LEAVE_A_TAKEOFF: Final = (Takeoff, *SET_POINTS)  #: commands that don't affect a take-off in progress; others end it
-#: Echo of a command that had no new effect because it was refused or held.
+#: Echo of a command that had no new effect because it was refused or already in effect.
 _NOTHING: Final = Idle()
 
 
@@ -71,7 +71,7 @@ class CommandHandler(FlightSupervisor):
     """Handles applications' requests to one vehicle. Public methods are thread-safe."""
 
     def configure(self, settings: FlightSettings) -> None:
-        """Apply new parameter values. Unchanged settings are the same objects as before."""
+        """Apply new parameter values. Settings that have not changed are the same objects as before."""
         with self._lock:
             airspace, space = self.checks.airspace, settings.airspace.space
             if space is not airspace.settings.space:
@@ -94,7 +94,7 @@ class CommandHandler(FlightSupervisor):
             return self.checks.airspace.ceiling_problem(altitude, self._publisher.feedback_now) if flies else ""
 
     def problem_with_moment(self) -> str:
-        """Return a readable reason not to write a momentary parameter, such as a flip, now; empty if there is none."""
+        """Return a readable reason why a momentary parameter, such as a flip, can't be written now; empty if it can."""
         with self._lock:
             ladder, others = self.ladder, self.flight.others
             if ladder.barred == "closing" or (ladder.barred and self._executor.airborne):
@@ -106,20 +106,20 @@ class CommandHandler(FlightSupervisor):
     # The end of a flight ----------------------------------------------------------------------------------------
 
     def order_landing(self, now_ns: int) -> bool:
-        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted.
+        """Land because the proxy is about to end. From now on, accept only landings and emergency stops.
 
-        Returns whether the proxy has a flight, or one may be about to begin.
+        Returns whether the proxy has a flight, or a flight may be about to begin.
         """
         with self._lock:
             self.ladder.order_landing()
             self._update_failsafe(now_ns)
             if self.flight.ours and self.flight.may_begin(now_ns):
-                self._rising_until_ns = now_ns  # keep withdrawing the take-off, because nothing else does so later
+                self._rising_until_ns = now_ns  # continue to withdraw the take-off, because nothing else does so later
             self._withdraw_takeoff(now_ns)
             return self.airborne
 
     def leave_hovering(self, now_ns: int) -> None:
-        """Leave a flying vehicle hovering as well as it can without the proxy, which is ending."""
+        """Leave a flying vehicle hovering as well as it can without the proxy, because the proxy is ending."""
         with self._lock:
             self.ladder.order_landing()
             try:
@@ -133,7 +133,7 @@ class CommandHandler(FlightSupervisor):
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle is, or may be, flying or about to fly, and the proxy must land it. Acquires no lock."""
+        """Whether the vehicle may be flying or about to fly, so that the proxy must land it. Acquires no lock."""
         return self.flight.ours and (self._executor.airborne or self.flight.may_begin(self._clock()))
 
     @property
@@ -150,7 +150,7 @@ class CommandHandler(FlightSupervisor):
     # The authority ----------------------------------------------------------------------------------------------
 
     def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
-        """Grant the authority or a position in the queue, or refuse the request, naming the holder."""
+        """Grant the authority or a position in the queue, or refuse the request and name the holder."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
         term_ns = None if request.for_s is None else nanoseconds(request.for_s)
@@ -160,7 +160,7 @@ class CommandHandler(FlightSupervisor):
             effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
             self._apply_authority(effects, now_ns)
             holder = authority.holder
-            assert holder is not None  # after a request there is always a holder
+            assert holder is not None  # after a request, there is always a holder
             if holder.app_id == app_id:
                 return AuthorityGranted(authority.lease, authority.until_ns or 0)
             name, position = name_of(self._sessions, holder.app_id), authority.position(app_id)
@@ -183,7 +183,7 @@ class CommandHandler(FlightSupervisor):
         return Done()
 
     def release_authority(self, session: Session, _request: ReleaseAuthority, now_ns: int) -> AnyReply:
-        """Take the authority back from an application, or remove it from the queue."""
+        """Take the authority away from an application, or remove it from the queue."""
         with self._lock:
             self._apply_authority(self.authority.release(session.app_id, now_ns), now_ns)
         return Done()
@@ -199,11 +199,11 @@ class CommandHandler(FlightSupervisor):
             holder = self.authority.holder
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease
 
-    # Commands: all but the first are called under the lock ----------------------------------------------------------
+    # Commands: all methods but the first are called under the lock --------------------------------------------------
 
     def command(self, session: Session, command: Command, now_ns: int) -> None:
-        """Check a command and execute it, on the receiving thread."""
-        # After the computer has slept, an old command looks as if it had just been sent: restore its true age.
+        """Check a command and execute it on the receiving thread."""
+        # After the computer has slept, an old command looks as if it had just been sent: correct the command's age.
         if self._slept() - self._slept_seen >= SLEEP_NS:
             with self._lock:
                 self._observe_sleep(now_ns)
@@ -222,9 +222,9 @@ class CommandHandler(FlightSupervisor):
             self._publish(COMMANDS, encode(echo))
 
     def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Return what was applied and when; for a refused command, when it was received."""
-        # On a machine that was idle, which is usual before a command, each function call costs microseconds. Ordinary
-        # commands are therefore received, judged and executed here; error messages are written elsewhere.
+        """Return what was applied and when. For a refused command, return when it was received."""
+        # On a machine that was idle, as is usual before a command, each function call costs microseconds. Ordinary
+        # commands are therefore received, judged and executed here. Error messages are written elsewhere.
         vehicle, checks, flight = self._publisher, self.checks, self.flight
         if vehicle.link_breaks != self._breaks_seen:
             self._observe_link(now_ns)
@@ -259,13 +259,13 @@ class CommandHandler(FlightSupervisor):
             if intent.reason is None:  # the intent was executed
                 return _NOTHING, self._count_applied(command)
             return self._refuse(session, command, intent.reason, intent.text), now_ns
-        intent.action = action  # a set-point may have decayed to hover
+        intent.action = action  # a set-point that timed out may have become a hover
         automatic, fresh = command.automatic, new
         new = new and not automatic  # the library's own actions don't count as a person's decision
         seen = Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
         decision = checks.decide(action, intent, seen, new=new, automatic=automatic)
         if decision.refusal is not None:
-            # A refusal may come with a substitute, a hover. If the vehicle rejects it, the old action must still end.
+            # A refusal may include a hover as a substitute. If the vehicle rejects it, the old action must still end.
             if decision.action is None or not self._executor.attempt(decision.action, now_ns, "apply"):
                 self._stop_before(kind, now_ns)
             return self._refuse_intent(session, command, intent, decision.refusal, decision.why, now_ns), now_ns
@@ -276,7 +276,7 @@ class CommandHandler(FlightSupervisor):
                 if decision.clamps:
                     self._counts["commands.clamped"] += 1
             try:
-                begins = new or (fresh and decision.takes_off)  # this includes a take-off repeated by a waiting call
+                begins = new or (fresh and decision.takes_off)  # this includes a take-off that a waiting call repeats
                 applied = self._executor.execute(decision.action, now_ns, new=begins)
             except RefusedError as error:
                 self._stop_before(kind, now_ns)
@@ -294,7 +294,7 @@ class CommandHandler(FlightSupervisor):
         intent.reason, intent.text = None, ""
         if kind is not ReturnToStart and decision.action is not None:
             checks.way_back = None
-        # Observe the return before reporting the intent, because "arrived" would still refer to the previous return.
+        # Observe the return before reporting the intent. Otherwise "arrived" would still refer to the previous return.
         if fresh and self._returns.observe():
             self._stamp()
         self._report_intent(session)
@@ -305,7 +305,7 @@ class CommandHandler(FlightSupervisor):
         return applied, applied_ns
 
     def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
-        """Make the flight ours after a new command from an application, or if no one else is flying the vehicle."""
+        """Attribute the flight to the proxy after an application's new command, or if no one else flies."""
         if type(applied) is Idle or not (new or self.flight.whose is not Whose.OTHERS):
             return
         others = self.flight.others
@@ -317,14 +317,14 @@ class CommandHandler(FlightSupervisor):
             self.on_ownership(True)
 
     def _stop_before(self, kind: type[Action], now_ns: int) -> None:
-        """Hover after a refused set-point, once the driver accepts it, so that the previous one does not continue."""
+        """Hover after a refused set-point, once the driver accepts it. The previous one must not continue."""
         moves = self._executor.state in (FlightState.FLYING, FlightState.HOVERING)
         if kind in SET_POINTS and moves and self.ladder.idle and not self.ladder.barred:
             self.ladder.hand_over(now_ns)
             self._update_failsafe(now_ns)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
-        """Execute any pilot's emergency stop, even without a lease, and however old or out of sequence."""
+        """Execute any pilot's emergency stop, even if it comes without a lease, late, or out of sequence."""
         intents, holds = session.intents, self.holds(session, command.lease)
         refusal = intents.check(command, now_ns, self.checks.max_age_ns, self.authority.lease, holds)
         intents.stop(command)
@@ -339,8 +339,8 @@ class CommandHandler(FlightSupervisor):
             why = self._publisher.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         if refusal is None:
-            self.authority.last_command_ns = now_ns  # repeats of a stop count as signs of life: nothing else is sent
-        self._rising_until_ns = None  # only the stop is sent
+            self.authority.last_command_ns = now_ns  # repeated stops count as signs of life: nothing else is sent
+        self._rising_until_ns = None  # only the stop request is sent
         self._end_intents(Fate.EMERGENCY, now_ns)
         self.checks.way_back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
@@ -368,7 +368,7 @@ class CommandHandler(FlightSupervisor):
     def _refuse_intent(
         self, session: Session, command: Command, intent: Intent, reason: Refusal, why: str, now_ns: int
     ) -> AnyAction:
-        """Refuse the holder's intent and end it, so that its repeats get the same answer."""
+        """Refuse the holder's intent and end it, so that repeats of the intent get the same answer."""
         intent.refuse(reason, why)
         self._report_intent(session)
         kind, seen = type(command.action), self._executor.seen(now_ns)

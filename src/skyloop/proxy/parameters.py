@@ -1,7 +1,7 @@
-"""Keep the parameters of a proxy and its driver in one typed store, and answer requests about them.
+"""Manage the parameters of a proxy and its driver in one typed store, and answer requests about them.
 
-Checking is pure (:func:`check`). If proxy and driver have a parameter with the same name, the driver's is shown and
-written, and the proxy obeys its value. An example is ``limits.tilt`` for a vehicle with a limit of its own.
+Checking is a pure function (:func:`check`). If proxy and driver have a parameter with the same name, the driver's
+is shown and written, and the proxy uses its value. An example is ``limits.tilt`` for a vehicle with its own limit.
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ from skyloop.proxy.requests import Session
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, check_written, space_of
 
 MAX_TEXT: Final = 1024  #: maximum number of characters in a text value
-MAX_PARAMETER: Final = 8192  #: maximum number of bytes in an encoded parameter; larger ones from a driver are left out
+MAX_PARAMETER: Final = 8192  #: maximum number of bytes in an encoded parameter; larger driver parameters are left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one reply
-#: A momentary parameter, such as a flip, is written within this time or not at all: its writer won't wait longer.
+#: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
@@ -55,7 +55,7 @@ _encoded = msgspec.msgpack.Encoder().encode
 
 
 def described(driver: Driver) -> list[Parameter]:
-    """Return a driver's parameters, plus one with the findings of its check. Raises the driver's errors."""
+    """Return a driver's parameters, plus one that contains the findings of its check. Raises the driver's errors."""
     parameters = list(driver.parameters())
     try:
         diagnostics = driver.checkup()
@@ -170,7 +170,7 @@ def check(parameter: Parameter, value: Value) -> Value:
 
 
 def _number(parameter: Parameter, number: float) -> float:
-    """Return a number to write, alone or in a vector, checked to be finite and within the range."""
+    """Return a number to write, alone or in a vector, after checking that it is finite and within the range."""
     if parameter.type is not ParameterType.INT:
         try:
             number = float(number)
@@ -207,7 +207,7 @@ def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
 
 
 def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: Collection[str]) -> FlightSettings:
-    """Return the settings with new values; parts without changed parameters stay the same object.
+    """Return the settings with new values. Parts whose parameters have not changed stay the same object.
 
     ``value``: the effective values by name; ``changed``: prefixes of the changed names, such as ``limits``. Raises
     :class:`ParameterError` if the no-fly zones can't be parsed.
@@ -250,7 +250,7 @@ def updated_settings(before: FlightSettings, value: Mapping[str, Any], changed: 
 
 
 class Parameters:
-    """The store. Thread-safe; it calls the driver on the caller's thread, outside its lock."""
+    """The store. Thread-safe. The driver is called on the caller's thread, outside the lock of this object."""
 
     def __init__(
         self,
@@ -262,15 +262,15 @@ class Parameters:
         self._lock = threading.Lock()
         self._own = {parameter.name: parameter for parameter in OWN}
         self._driver: dict[str, Parameter] = {}
-        self._presets: dict[str, Value] = {}  # presets not yet written to the driver
+        self._presets: dict[str, Value] = {}  # preset values that have not yet been written to the driver
         self.left_out: tuple[str, ...] = ()  #: names of the driver's parameters that are too large to send
         self._in_force: dict[str, Any] = {}  # values of the proxy's own parameters
-        self._changed: set[str] = set()  # prefixes of the names of parameters that the settings don't reflect yet
+        self._changed: set[str] = set()  # prefixes of parameter names whose changes are not in the settings yet
         self._settings = FlightSettings()
         self._apply(OWN)
 
     def preset(self, values: Mapping[str, Value]) -> None:
-        """Set values for the proxy's own parameters before it starts; :meth:`write_presets` writes the vehicle's."""
+        """Set the proxy's own parameters before it starts; :meth:`write_presets` sets the vehicle's."""
         for name, value in check_presets(values).items():
             self._own[name] = msgspec.structs.replace(self._own[name], value=value)
             self._presets[name] = value
@@ -278,7 +278,7 @@ class Parameters:
             self._apply(OWN)
 
     def write_presets(self) -> list[tuple[str, str]]:
-        """Write presets to the vehicle's parameters; return which ones failed, with reasons."""
+        """Write presets to the vehicle's parameters. Return which presets failed, with the reasons."""
         problems = []
         for name in [name for name in self._presets if name in self._driver]:
             try:
@@ -286,7 +286,7 @@ class Parameters:
             except Exception as error:  # noqa: BLE001  a driver may raise anything; it is retried on the next occasion
                 problems.append((name, str(error)))
             else:
-                del self._presets[name]  # from here on, pilots may change it
+                del self._presets[name]  # pilots may change it from now on
         return problems
 
     def refresh(self) -> None:
@@ -307,7 +307,7 @@ class Parameters:
             return parameter
 
     def number(self, name: str) -> float:
-        """Return the effective value of one of the proxy's own parameters: the driver's, if the driver has it, too."""
+        """Return the value in force for one of the proxy's own parameters (the driver's value if it has one)."""
         value: float = self._in_force[name]
         return value
 
@@ -335,7 +335,7 @@ class Parameters:
             return self._settings
 
     def set(self, name: str, value: Value, known: Parameter | None = None) -> Parameter:
-        """Write one parameter and return its new state; ``known``: its state as just returned by :meth:`get`."""
+        """Write one parameter and return its new state. ``known``: its state as just returned by :meth:`get`."""
         parameter = known or self.get(name)
         value = check(parameter, value)
         with self._lock:
@@ -352,7 +352,7 @@ class Parameters:
         return written
 
     def page(self, first: int) -> ParameterPage:
-        """Return as many parameters as fit into one reply, sorted by name, starting at index ``first``."""
+        """Return as many parameters as fit into one reply, sorted by name, from index ``first`` on."""
         with self._lock:
             everything = sorted({**self._own, **self._driver}.values(), key=lambda parameter: parameter.name)
         chosen: list[Parameter] = []
@@ -368,8 +368,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. Because these also change without being
-    written, each is read again every time, and changes cause no event.
+    ``free``: parameters that any pilot may write without the authority. These parameters also change without being
+    written. Each parameter is therefore read again every time, and changes cause no event.
     """
 
     def __init__(
@@ -389,7 +389,7 @@ class ParameterRequests:
         self._clock = clock
 
     def read_driver(self) -> None:
-        """Read the driver's parameters; keep the old ones if it raises."""
+        """Read the driver's parameters; keep the old parameters if it raises an error."""
         try:
             self._parameters.refresh()
         except Exception as error:  # noqa: BLE001  it is reported, and the flight continues
@@ -411,12 +411,12 @@ class ParameterRequests:
         return ParameterValue(self._parameters.get(request.name))
 
     def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
-        """Read the driver's parameters again, and answer with a page of all parameters."""
+        """Read the driver's parameters again, and answer with one page of all parameters."""
         self.read_driver()
         return self._parameters.page(request.first)
 
     def set(self, session: Session, request: SetParameter, now_ns: int) -> AnyReply:
-        """Write a parameter for the holder of the authority. Raises the errors of :meth:`Parameters.set`."""
+        """Write a parameter on behalf of the holder of the authority. Raises the errors of :meth:`Parameters.set`."""
         name, value = request.name, request.value
         waited_ns, known = self._clock() - now_ns, self._parameters.get(name)
         if known.momentary and waited_ns > MOMENT_NS:

@@ -1,8 +1,8 @@
-"""The proxy, a node through which any number of applications observe a vehicle and one at a time flies it.
+"""The proxy, a node that lets any number of applications observe a vehicle and one at a time fly it.
 
-Threads: those of the transport execute commands and pass on poses, those of the driver publish, a ticker (50 Hz)
-    updates authority, failsafe and autopilot, and one more answers requests. The handler's lock is held during every
-    driver call that flies the vehicle, including those in :meth:`end`.
+Threads: the transport's threads execute commands and pass on poses. The driver's threads publish. A ticker (50 Hz)
+    updates authority, failsafe and autopilot, and one more thread answers requests. The handler's lock is held during
+    every driver call that flies the vehicle, including those in :meth:`end`.
 """
 
 from __future__ import annotations
@@ -70,17 +70,17 @@ from skyloop.transport.base import Peer, TransportServer
 MAX_NAME: Final = 64  #: maximum number of characters in a proxy's name
 
 _POLL_S: Final = 0.2
-_ABANDON_S: Final = 1.0  #: how long ending a proxy waits for its other parts if the driver hangs
+_ABANDON_S: Final = 1.0  #: time to wait for the proxy's other parts to end if the driver hangs
 _log = logging.getLogger(__name__)
 
 
 class Proxy:
-    """Owns a driver and its transport server, neither open yet, from :meth:`start` to :meth:`end`; a context manager.
+    """Owns a driver and its transport server, both not open yet, from :meth:`start` to :meth:`end`. A context manager.
 
-    Applications connect by ``name``, which has 1 to 64 characters. ``clock`` gives the time of all samples [ns]. With
-    ``ticker=False``, the caller calls :meth:`tick`, for example for many proxies in a process, or in simulated time.
-    ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept`` returns how long
-    the computer has slept in total [ns]; the default is the system's if ``clock`` is.
+    Applications connect by ``name``, which must have 1 to 64 characters. ``clock`` gives the time of all samples [ns].
+    With ``ticker=False``, the caller must call :meth:`tick`, for example for many proxies in one process or in
+    simulated time. ``jobs`` answers requests that may wait for the vehicle, by default on a separate thread. ``slept``
+    returns how long the computer has slept in total [ns]; its default is the system's if ``clock`` is the system's.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Proxy:
             clock=clock,
             capabilities=self.capabilities,
             state_of=flight.state,
-            # Read the driver's parameters again now that the vehicle answers.
+            # Read the driver's parameters again, because the vehicle answers now.
             on_link_up=lambda: self._requests.call_later(self._parameter_requests.read_driver),
             scrub=driver.uri.scrub,
         )
@@ -176,12 +176,12 @@ class Proxy:
         self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write an audit trail; it is closed when the proxy ends. Call before :meth:`start`."""
+        """Write an audit trail, and close it when the proxy ends. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
 
     def keep_record(self, record: FlightRecord) -> None:
-        """Record the proxy's flight in this file, and end a flight recorded there. Call before :meth:`start`."""
+        """Record the flight in this file, and end a flight that is recorded there. Call before :meth:`start`."""
         self._record = record
         self.handler.on_ownership = record.set
 
@@ -205,7 +205,7 @@ class Proxy:
             raise
         if self._trail is not None:
             self._trail.begin(str(self.driver.uri))
-        if self._record is not None:  # now that the name is ours
+        if self._record is not None:  # the name is ours from here on
             left_s = self._record.left_s()
             if left_s > 0.0:
                 self.handler.flight.began_before(self.clock() + nanoseconds(left_s))
@@ -231,19 +231,19 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight, then the proxy, and release all resources. Idempotent. Not for the driver's own threads.
+        """End the flight, then the proxy, and release all resources. Idempotent. Must not be called by the driver.
 
-        First, everything except landings and emergency stops is barred permanently, whether or not the vehicle is
-        flying. A vehicle that is flying is then landed within ``within_s`` [s]; 0: don't land. If it does not land in
-        time, it is left hovering if it can hover without the proxy; otherwise it gets a final set-point of zero speed.
+        First, everything except landings and emergency stops is refused permanently, whether or not the vehicle is
+        flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it
+        is left hovering if it can hover without the proxy. Otherwise the driver gets a final set-point of zero speed.
 
         ``hurry`` is called several times a second; True ends the wait for the landing. A vehicle that can't hover
-        without the proxy is still landed, however long it takes, because otherwise it would fall. With
+        without the proxy is still landed, however much time has passed, because it would fall otherwise. With
         ``unless_flying``, the landing and the proxy continue if the vehicle does not land in time. With ``hangs``, the
-        driver hangs or fails: nothing waits for it, it is not asked to land or hover, and calls that may hang are left
-        to daemon threads, as if the proxy had been killed.
+        driver hangs or fails: nothing waits for the driver, and it is not asked to land or hover. Calls that may hang
+        are left to daemon threads, as if the proxy had been killed.
 
-        Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done; if
+        Returns whether no flight of the proxy remains. Raises the error of a failed step once all steps are done. If
         the driver hangs, errors are logged instead.
         """
         if not self._started or self.ended:
@@ -261,21 +261,21 @@ class Proxy:
             self.ended = True
         self._stopping.set()
         severity = Severity.ERROR if hangs else Severity.WARNING
-        with ExitStack() as steps:  # the steps run from last to first, even if others raise
+        with ExitStack() as steps:  # the steps run in reverse order, even if some of them raise
             for kept in (self._record, self._trail):
                 if kept is not None:
                     steps.callback(kept.close)
             steps.callback(self._abandon if hangs else self._close)
             steps.callback(self.overview.end)
             steps.callback(self.events.publish, EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", severity)
-            if not hangs:  # this runs first: stop obeying and steering
+            if not hangs:  # this runs first: stop obeying commands and steering
                 steps.callback(lambda: self.handler.leave_hovering(self.clock()))
                 if self._ticker is not None and self._ticker.is_alive():
                     self._ticker.join()
         return landed
 
     def _land(self, within_s: float, hurry: Callable[[], bool]) -> bool:
-        """Land a flying vehicle; return whether no flight of the proxy remains."""
+        """Land the vehicle if it flies; return whether no flight of the proxy remains."""
         handler, hovers = self.handler, "hover" in self.capabilities.actions
         deadline_s = time.monotonic() + within_s
         while time.monotonic() < deadline_s and not (hovers and hurry()):
@@ -293,7 +293,7 @@ class Proxy:
             steps.callback(self._requests.stop)
 
     def forked(self) -> None:
-        """Leave the vehicle and the clients to the parent process; called in a child of ``os.fork``."""
+        """Leave the vehicle and the clients to the parent process. Called in a child of ``os.fork``."""
         self.ended = True
 
     def _abandon(self) -> None:
@@ -325,11 +325,11 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, whose name and role are unknown until its Hello."""
+        """Handle a new connection. The application's name and role are unknown until its Hello."""
         self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle an application's packet, on the receiving thread."""
+        """Handle an application's packet on the receiving thread."""
         now_ns = self.clock()
         session = self._sessions.get(peer.id)
         if session is None or session.ended:
@@ -358,7 +358,7 @@ class Proxy:
             self._malformed(session, f"{kind.__name__} may only be sent by the proxy", now_ns)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Count and report a packet not allowed by the sender's keys, or whose sender is not connected."""
+        """Count and report a packet that the sender's keys don't allow, or whose sender is not connected."""
         session = self._sessions.get(peer.id)
         name = None if session is None else session.name
         code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
@@ -374,7 +374,7 @@ class Proxy:
         )
 
     def topic_problem(self, topic: str) -> str:
-        """Return why a topic can't be subscribed to, or an empty string if it can be."""
+        """Return why a topic can't be subscribed to, or an empty string if it can."""
         return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -393,7 +393,7 @@ class Proxy:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
             news.append(EventDraft(EventKind.APPLICATION_LINK, text, app=session.name, data=data))
-        if self._stopping.is_set():  # all applications are leaving, and the driver may be closed already
+        if self._stopping.is_set():  # all applications are leaving, and the driver may already be closed
             self.events.publish_drafts(*news)
         else:
             self.handler.application_left(session, self.clock(), news)
@@ -401,7 +401,7 @@ class Proxy:
         del self._sessions[peer.id]
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
-        """Count a packet as malformed if a reason is given, and end a connection that sends too many."""
+        """Count a packet as malformed if a reason is given. End a connection that sends too many."""
         if not reason:
             return
         self._counts["packets.malformed"] += 1
@@ -423,7 +423,7 @@ class Proxy:
 
     def tick(self, now_ns: int) -> None:
         """Update all that depends on time: authority, failsafe, autopilot, events, and a silent vehicle's feedback."""
-        if self._stopping.is_set():  # a shared ticker, or one that was hanging, may tick after the end
+        if self._stopping.is_set():  # a shared ticker, or a ticker that was hanging, may still tick after the end
             return
         self.tick_flight(now_ns)
         self._end_silent(now_ns)
@@ -432,7 +432,7 @@ class Proxy:
         self.overview.tick(now_ns)
 
     def tick_flight(self, now_ns: int) -> None:
-        """Do the part of :meth:`tick` that a flight needs 50 times a second; the rest may run less often."""
+        """Do the part of :meth:`tick` that a flight needs 50 times a second. The other parts may run less often."""
         if self._stopping.is_set():
             return
         self.handler.tick(now_ns)
@@ -440,11 +440,11 @@ class Proxy:
 
     @property
     def at_rest(self) -> bool:
-        """Whether feedback already shows that the vehicle is not flying and has no pilot, so that nothing is urgent."""
+        """Whether feedback already shows that the vehicle is not flying and has no pilot. If so, nothing is urgent."""
         return self.handler.at_rest and self.publisher.is_shown
 
     def _end_silent(self, now_ns: int) -> None:
-        """End connections that have sent no Hello, because they take up places."""
+        """End connections that have sent no Hello, because they occupy places."""
         for session in list(self._sessions.values()):
             if session.role is None and not session.ended and now_ns - session.joined_ns > HELLO_NS:
                 session.ended = True
@@ -480,7 +480,7 @@ class Proxy:
         return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
 
     def statistics(self) -> dict[str, float]:
-        """Return all counters by dotted name, the same as for ``GetStatistics``. Thread-safe."""
+        """Return all counters by dotted name, as ``GetStatistics`` does. Thread-safe."""
         return self._counters.snapshot(applications=self.applications, **self.server.counters)
 
     @property

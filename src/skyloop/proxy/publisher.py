@@ -55,10 +55,10 @@ _VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2"
 class VehiclePublisher:
     """The driver's :class:`skyloop.drivers.base.Sink`, and the newest known state of the vehicle.
 
-    It acquires no lock that is held while the driver is called, so a driver may call it on any thread, even
-    re-entrantly.
+    It never acquires a lock that is held while the driver is called, so a driver may call it on any thread, even from
+    inside such a call.
 
-    ``state_of`` returns the flight state, given the driver's, because the software autopilot may know better.
+    ``state_of`` returns the flight state, given the driver's state, because the software autopilot may know better.
     ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
     in the vehicle's address from a text.
     """
@@ -78,10 +78,10 @@ class VehiclePublisher:
         self.feedback_now: Feedback | None = None  #: the newest sample, as it was published
         self.reported_state = FlightState.UNKNOWN  #: the state reported by the driver, without the software autopilot
         self.link_state = LinkState.CONNECTING
-        self.link_reason = ""  #: what is being waited for, and the last failure
-        self.link_remedy = ""  #: what a person can do about it
+        self.link_reason = ""  #: what the link is waiting for, and its last failure
+        self.link_remedy = ""  #: what a person can do about the problem
         self.link_up = False
-        self.link_breaks = 0  #: number of times the link went down or came back
+        self.link_breaks = 0  #: number of times that the link went down or came back
         self.state_of = state_of
         self.variants = FeedbackVariants(server, counters, clock)
         self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
@@ -89,7 +89,7 @@ class VehiclePublisher:
         self._scrub = scrub
         self._owner: dict[str, Any] = {}
         self._newest: tuple[Intent, int, str] = NO_INTENT, 0, ""
-        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # as in the newest sample
+        self._shown_outcome: tuple[Fate, Refusal | None] = Fate.UNDER_WAY, None  # the same as in the newest sample
         self._capabilities = capabilities
         self._publish = server.publish
         self._publish_frame = server.publish_frame
@@ -120,7 +120,7 @@ class VehiclePublisher:
             self._publish_state(before, after)
 
     def _finite(self, raw: Feedback) -> Feedback:
-        """Return feedback with NaN and infinite numbers replaced by unknown, so that readers need not handle them."""
+        """Return feedback with NaN and infinite numbers replaced by None, so that readers need not handle them."""
         vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
         total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
         total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
@@ -136,19 +136,19 @@ class VehiclePublisher:
         return _replace(raw, **dict.fromkeys(wrong))
 
     def stamp(self, owner: dict[str, Any]) -> None:
-        """Set the proxy's own fields in feedback; they are published by the next tick."""
+        """Set the proxy's own fields in feedback. The next tick publishes them."""
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
     def tell(self, intent: Intent, app_id: int, name: str) -> None:
-        """Set the outcome of an intent in feedback; if the intent has ended, the next tick publishes the outcome."""
+        """Set the outcome of an intent in feedback. If the intent has ended, the next tick publishes the outcome."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:
             self._published_ns = -KEEP_ALIVE_NS
 
     @property
     def is_shown(self) -> bool:
-        """Whether feedback shows the current state of the proxy and the link."""
+        """Whether feedback contains the current state of the proxy and the link."""
         return self._published_ns >= 0
 
     def keep_alive(self, now_ns: int) -> None:
@@ -210,7 +210,7 @@ class VehiclePublisher:
         )
 
     def overview(self, name: str, uri: str, event: Event | None, *, applications: int) -> VehicleOverview:
-        """Return the vehicle's row in the overview; ``event``: the newest event."""
+        """Return the vehicle's row in the overview. ``event``: the newest event."""
         known = self.feedback_now or Feedback(captured_ns=0)
         return VehicleOverview(
             name=name,
@@ -289,11 +289,11 @@ class VehiclePublisher:
         return self.streams.problem(topic, request, info)
 
     def wants(self, camera: str) -> bool:
-        """Return whether this camera's frames are in use at present."""
+        """Return whether this camera's frames are currently in use."""
         return self.wanted_fps(camera) > 0.0
 
     def wanted_fps(self, camera: str) -> float:
-        """Return how many of this camera's frames are used per second: infinity for all, 0 for none."""
+        """Return how many of this camera's frames are used per second; infinity means all of them, 0 none."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
@@ -312,7 +312,7 @@ class VehiclePublisher:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """Publish a frame as encoded by the vehicle."""
+        """Publish a frame as the vehicle encoded it."""
         with self._frame_lock:
             seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
         self._counts[f"streams.{camera}.received"] += 1
@@ -330,7 +330,7 @@ class VehiclePublisher:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
 
     def wants_stream(self, camera: str) -> bool:
-        """Return whether this camera's encoded frames have receivers."""
+        """Return whether anyone receives this camera's encoded frames."""
         return self._subscribers(stream(camera)) > 0 or self.streams.wants_own(camera)
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
@@ -342,7 +342,7 @@ class VehiclePublisher:
     # Link and events -------------------------------------------------------------------------------------------
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Publish a change of the vehicle link at once; the flight reacts at its next step."""
+        """Publish a change of the vehicle link immediately. The flight reacts at its next step."""
         reason, remedy = (shortened(self._scrub(text), MAX_LINK_TEXT) for text in (reason, remedy))
         with self._publishing:
             same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
@@ -351,7 +351,7 @@ class VehiclePublisher:
             was_up, self.link_up = self.link_up, state in _LINK_UP
             if was_up != self.link_up and (was_up or self.link_breaks):  # not counting the first time that it comes up
                 self.link_breaks += 1
-            self._published_ns = -KEEP_ALIVE_NS  # published in feedback at the next tick
+            self._published_ns = -KEEP_ALIVE_NS  # to be published in feedback at the next tick
         if same:
             return
         change = state.value if before is state else f"{before.value} → {state.value}"
@@ -365,21 +365,21 @@ class VehiclePublisher:
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Publish an event from the driver; repeated driver errors are published once a second."""
+        """Publish an event from the driver. Repeated driver errors are published once a second."""
         if kind is EventKind.DRIVER_ERROR:
             self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
         else:
             self._events.publish(kind, text, severity, data=data)
 
     def driver_failed(self, where: str, error: BaseException) -> str:
-        """Report that a call of the driver failed; return the text for the requester."""
+        """Report that a driver call failed; return the text for the requester."""
         self._counts["driver.errors"] += 1
         self._fail(where, f"driver failed in {where}: {error!r}")
         return self._scrub(f"the driver failed: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
-        """Return the text for the sender of a command that made the driver raise; also publish unexpected errors."""
-        if isinstance(error, SkyloopError):  # the vehicle's own reason
+        """Return the text for the sender of a command that made the driver raise. Publish unexpected errors, too."""
+        if isinstance(error, SkyloopError):  # the reason that the vehicle gave
             self._counts["driver.errors"] += 1
             return self._scrub(str(error))
         return self.driver_failed(where, error)

@@ -1,11 +1,11 @@
-"""Write a proxy's files, each on a separate thread: the audit trail, and the note about its flight.
+"""Write a proxy's files, each on a separate thread: the audit trail, and the note about the proxy's flight.
 
-The audit trail records who flew when, as one JSON object per line, append-only. ``docs/sharing.md`` describes it.
-:func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
+The audit trail records who flew when, as one JSON object per line. Lines are only appended. ``docs/sharing.md``
+describes it. :func:`entry_of` and :func:`tenures` are pure: they turn events into lines, and lines into a table.
 
-The note records that a flight is this proxy's, so that a proxy that was killed and restarted ends its own flight. It is
-written when a flight becomes the proxy's, refreshed while that lasts, and removed when the flight is over, belongs to
-others, or can no longer turn up. It is valid for :data:`LIFE_S`; after that, others may have taken off.
+The note records that a flight belongs to this proxy, so that a proxy that was killed and restarted ends its own flight.
+It is written when a flight becomes the proxy's, and refreshed during the flight. It is removed when the flight is over,
+is someone else's, or can no longer turn up. It is valid for :data:`LIFE_S`. After that time, others may have taken off.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ from skyloop.errors import UsageError
 from skyloop.messages import Event, EventKind, FlightState
 from skyloop.proxy.core.flight import BELIEF_NS
 
-CLOSE_S: Final = 2.0  #: how long ending a proxy waits for each file
+CLOSE_S: Final = 2.0  #: time to wait for each file when a proxy ends
 FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
 _MODE: Final = 0o600
 
-#: How long a note is valid; supervisors restart a proxy within seconds, before another pilot takes over.
+#: How long a note is valid. Supervisors restart a proxy within seconds, before another pilot takes over.
 LIFE_S: Final = seconds(BELIEF_NS)
 KEEP_S: Final = 2.0  #: how often the note is refreshed
-MAX_BYTES: Final = 4096  #: maximum length of an address; a longer file is not ours
+MAX_BYTES: Final = 4096  #: maximum length of an address; a longer file can't be ours
 NOTE_SUFFIX: Final = ".flight"
 
 _log = logging.getLogger(__name__)
 
 
 class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One line of an audit trail, whose other fields depend on ``what``."""
+    """One line of an audit trail. The line's other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
     proxy: str
     run: str  #: random identity of the proxy's run
     what: str  #: ``begin``, ``granted``, ``ended``, ``takeoff``, ``landed``, ``emergency`` or ``end``
     who: str = ""  #: name of the application
-    identity: str = ""  #: what the transport knows: process and user, or the name in a certificate
+    identity: str = ""  #: what the transport knows about it: process and user, or the name in its certificate
     lease: int = 0
     priority: int = 0
-    how: str = ""  #: why a lease, or the run, ended; in ``begin``, the vehicle's address
+    how: str = ""  #: why a lease or the run ended; for ``begin``, the vehicle's address
 
 
 class Tenure(msgspec.Struct, frozen=True):
-    """The time during which an application held the authority, from a grant to its end."""
+    """The period during which an application held the authority, from a grant to its end."""
 
     proxy: str
     who: str
@@ -69,7 +69,7 @@ class Tenure(msgspec.Struct, frozen=True):
 
 
 def entry_of(event: Event, at: datetime, proxy: str, run: str) -> Entry | None:
-    """Return the line for an event; None for events that the trail does not record."""
+    """Return the line for an event; None if the trail does not record such events."""
     data, who = event.data, event.app or ""
     lease = data.get("lease")
     numbered = Entry(at, proxy, run, "", who, lease=lease if isinstance(lease, int) else 0)
@@ -101,7 +101,7 @@ def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
 
 
 def tenures(entries: Iterable[Entry]) -> list[Tenure]:
-    """Return all tenures in order of the grants; entries of several proxies may be mixed."""
+    """Return all tenures in the order of their grants. Entries of several proxies may be mixed."""
     done: list[Tenure] = []
     held: dict[str, int] = {}
     for entry in entries:
@@ -123,7 +123,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
 
 
 def read(path: Path) -> tuple[list[Entry], int]:
-    """Return a file's entries and the number of unreadable lines (for example, cut off by a crash)."""
+    """Return a file's entries, and the number of unreadable lines (for example, lines cut off by a crash)."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
@@ -175,7 +175,7 @@ class AuditTrail:
             self._queue.put(entry)
 
     def close(self) -> None:
-        """Write the remaining lines, within :data:`CLOSE_S`."""
+        """Write the remaining lines. Writing takes at most :data:`CLOSE_S`."""
         self._queue.put(None)
         self._thread.join(CLOSE_S)
 
@@ -188,7 +188,7 @@ class AuditTrail:
 
     def _write(self, line: bytes) -> None:
         try:
-            os.write(self._file, line)  # a single call, so that the lines of several writers do not mix
+            os.write(self._file, line)  # a single call, so that lines from several writers do not mix
             self._failed = False
         except OSError as error:
             if not self._failed:  # a full disk is logged once, and the flight continues
@@ -200,23 +200,23 @@ class AuditTrail:
 
 
 def record_path(name: str) -> Path:
-    """Return a proxy's file, which is next to its socket, where only its user may write."""
+    """Return a proxy's file. The file is next to the proxy's socket, where only the proxy's user may write."""
     from skyloop.transport.local.directory import find_directory
 
     return find_directory().path / (name + NOTE_SUFFIX)
 
 
 class FlightRecord:
-    """The file with one proxy's flight record, written on a separate thread from :meth:`start` to :meth:`close`.
+    """The file that holds one proxy's flight record. A separate thread writes it from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored; ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored. ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:
         self.path = path
         self._vehicle = vehicle
         self._wall = wall
-        self._ours: bool | None = None  # None while unknown: the note stays unchanged
+        self._ours: bool | None = None  # None while unknown: the note then stays unchanged
         self._written = False
         self._failed = False
         self._closing = False
@@ -239,7 +239,7 @@ class FlightRecord:
         self._thread.start()
 
     def set(self, ours: bool) -> None:
-        """Record whether the flight is this proxy's. Thread-safe; never waits."""
+        """Record whether the flight belongs to this proxy. Thread-safe. Never waits."""
         if ours is not self._ours:
             self._ours = ours
             self._changed.set()
@@ -250,14 +250,14 @@ class FlightRecord:
         if thread is not None:
             self._closing = True
             self._changed.set()
-            thread.join(CLOSE_S)  # a file system may hang, but the end of the proxy must not
+            thread.join(CLOSE_S)  # a file system may hang, but the proxy must still end
 
     def _run(self) -> None:
         closing = False
         while not closing:
             self._changed.wait(KEEP_S if self._ours else None)
             self._changed.clear()
-            closing = self._closing  # read before the state, so that a change during the write is not missed
+            closing = self._closing  # read this before the state, so that a change during the write is not missed
             try:
                 self._write()
             except OSError as error:

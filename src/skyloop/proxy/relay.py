@@ -1,6 +1,6 @@
 """Relay what applications send: annotations, logs and results to subscribers, and poses to the driver.
 
-Results come from the workers of processors: :class:`WorkerRoster`, which is pure, assigns frames to them;
+Results come from the workers of processors. :class:`WorkerRoster`, a pure class, assigns frames to the workers.
 :class:`ProcessorWorkers` sends each worker its share and relays its results.
 """
 
@@ -39,18 +39,18 @@ from skyloop.proxy.requests import Session
 from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
-MAX_ANNOTATION: Final = 32_768  #: bytes in an annotation's packet
-#: A worker that is silent for this long loses its share, because it or its host hangs.
+MAX_ANNOTATION: Final = 32_768  #: number of bytes in an annotation's packet
+#: A worker that is silent for this long loses its share, because the worker or its host hangs.
 SILENT_S: Final = 1.0
-#: How far in the future a result's frame may be, because of errors in its camera's clock.
+#: How far in the future the capture time of a result's frame may be, because of errors in its camera's clock.
 MAX_AHEAD_S: Final = 1.0
 MAX_JOINED: Final = 8  #: maximum number of processors that one application may work for
 
-_Key = tuple[int, str]  # number of the application, name of the processor
+_Key = tuple[int, str]  # number of the application, and name of the processor
 
 
 class Relay:
-    """Relays annotations, log entries and poses, on the receiving thread. No authority is needed."""
+    """Relays annotations, log entries and poses on the receiving thread. No authority is needed."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Relay:
         self._counts = counters.counts
 
     def annotation(self, session: Session, annotation: Annotation, packet: bytes) -> str:
-        """Relay an annotation to its subscribers; return why it is malformed, or an empty string."""
+        """Relay an annotation to its subscribers. Return why the annotation is malformed, or an empty string."""
         if unknown := camera_problem(annotation.camera, self._cameras):
             return f"an annotation of an unknown frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
@@ -75,7 +75,7 @@ class Relay:
         return self._publish(session, ANNOTATIONS, packet)
 
     def log(self, session: Session, packet: bytes) -> str:
-        """Relay a log entry to its subscribers; return why it is malformed, or an empty string."""
+        """Relay a log entry to its subscribers. Return why the entry is malformed, or an empty string."""
         return self._publish(session, LOGS, packet)
 
     def _publish(self, session: Session, topic: str, packet: bytes) -> str:
@@ -119,7 +119,7 @@ class Relay:
 
 
 class ProcessorWorkers:
-    """Sends workers their shares, and relays results. Thread-safe."""
+    """Sends workers their shares of the frames, and relays their results. Thread-safe."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ class ProcessorWorkers:
         self._sent: dict[_Key, ProcessorShare] = {}
 
     def join(self, session: Session, asked: JoinProcessor, now_ns: int) -> AnyReply:
-        """Make the application a worker, or renew it as one, and send it its share."""
+        """Make the application a worker, or renew its registration as one, and send it its share of the frames."""
         app_id = session.app_id
         with self._lock:
             before = self._roster.find(app_id, asked.processor)
@@ -159,7 +159,7 @@ class ProcessorWorkers:
         return Done()
 
     def application_left(self, session: Session) -> None:
-        """Remove an application whose connection has ended; the others get its share."""
+        """Remove an application whose connection has ended. The other workers get its share."""
         with self._lock:
             if self._sessions.pop(session.app_id, None) is None:
                 return
@@ -179,7 +179,7 @@ class ProcessorWorkers:
             self._publish_change(session, asked, "silent", text)
 
     def relay(self, session: Session, result: ProcessorResult, now_ns: int) -> str:
-        """Relay a result to its subscribers, marked with the number of the sending application.
+        """Relay a result to its subscribers, marked with the number of the application that sent it.
 
         Returns why it is malformed, or an empty string. A refused result is counted, and published as an event.
         """
@@ -192,7 +192,7 @@ class ProcessorWorkers:
             why = f"it is not a worker of processor {result.processor}"
         elif result.camera != worker.asked.camera:
             why = f"it works for {result.processor} on frames of {worker.asked.camera}, not of {result.camera}"
-        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all later results would count as older
+        elif result.captured_ns - now_ns > nanoseconds(MAX_AHEAD_S):  # all later results would otherwise count as older
             why = f"its frame's capture time is {seconds(result.captured_ns - now_ns):.1f} s in the future"
         if why:
             self._counts["results.refused"] += 1
@@ -230,7 +230,7 @@ class ProcessorWorkers:
         return f"{who} {why}: all its workers must do the same"
 
     def _send_shares(self) -> None:
-        """Send each worker its share if it has changed."""
+        """Send each worker its share of the frames if the share has changed."""
         shares = self._roster.shares()
         self._sent = {key: share for key, share in self._sent.items() if key in shares}
         for key, share in shares.items():
@@ -247,7 +247,7 @@ class ProcessorWorkers:
 
 @dataclass(slots=True)
 class Worker:
-    """One application in its role as a worker of one processor."""
+    """One application as a worker for one processor."""
 
     asked: JoinProcessor
     received_ns: int
@@ -265,14 +265,14 @@ class WorkerRoster:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """Return the application's worker for that processor, or None if it isn't one."""
+        """Return the application's worker for that processor; None if the application does not work for it."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
         self._workers[app_id, asked.processor] = Worker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:
-        """Remove an application; return its memberships."""
+        """Remove an application, and return the processors that it worked for."""
         keys = [key for key in self._workers if key[0] == app_id]
         return [self._workers.pop(key).asked for key in keys]
 
@@ -281,7 +281,7 @@ class WorkerRoster:
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
-        """Return another worker with that name that conflicts with this one, if any."""
+        """Return another worker with that name that conflicts with this worker, if there is one."""
         for (app, name), worker in self._workers.items():
             other = worker.asked
             alike = (other.code, other.shared) == (asked.code, asked.shared)

@@ -1,9 +1,9 @@
-"""Handle connections and their requests: each request is executed once and answered as often as it is sent.
+"""Handle connections and their requests. Each request is executed only once, but answered each time it is sent.
 
-A client repeats a request, with the same number, until its answer arrives. A repeat of a pending request is merged with
-it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state (Hello,
-authority, Ping) are answered at once on the receiving thread, so that a take-over never waits behind a slow parameter.
-Requests that may involve the driver are answered on a separate thread.
+A client repeats a request, with the same number, until it receives the answer. A repeat of a pending request is merged
+with it; a repeat of a request that changed something gets the stored answer. Requests about the proxy's own state
+(Hello, authority, Ping) are answered immediately on the receiving thread, so that a take-over never waits behind a slow
+parameter. Requests that may involve the driver are answered on a separate thread.
 """
 
 from __future__ import annotations
@@ -38,40 +38,40 @@ from skyloop.proxy.core.command_checks import Intents
 from skyloop.proxy.events import Counters, Episodes
 from skyloop.transport.base import Peer, TransportServer
 
-MAX_PENDING: Final = 16  #: maximum number of an application's waiting requests; further ones are refused
-#: More malformed packets than this within a second end the connection, whose ends evidently speak different protocols.
+MAX_PENDING: Final = 16  #: maximum number of an application's waiting requests; further requests are refused
+#: More malformed packets than this within a second end the connection: its ends evidently use different protocols.
 MAX_MALFORMED: Final = 50
-#: Time limit for a connection's Hello, which clients send at once.
+#: Time limit for a connection's Hello, which clients send immediately.
 HELLO_NS: Final = 5 * NS_PER_S
 
 MAX_KEPT: Final = 32  #: number of answers stored per connection; clients repeat requests for a few seconds at most
 MAX_MESSAGE: Final = 1000  #: maximum number of characters in a refusal's message
 
 _AUTHORITY: Final = (RequestAuthority, ReleaseAuthority)
-#: Requests that change something. Others may be answered again, with the state at the time of the repeat.
+#: Requests that change something. Repeats of other requests may be answered again, with the state at that time.
 _CHANGING: Final = (*_AUTHORITY, AnswerTakeover, SetParameter, JoinProcessor)
 
 _log = logging.getLogger(__name__)
 
 
 class Session:
-    """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
+    """One application's connection, from joining to leaving. ``role`` is None until the application sends Hello."""
 
     def __init__(self, peer: Peer, joined_ns: int) -> None:
         self.peer = peer
         self.joined_ns = joined_ns
         self.app_id = peer.id
-        self.name = f"application {peer.id}"  #: name of the application, preliminary until its Hello
+        self.name = f"application {peer.id}"  #: name of the application; preliminary until its Hello
         self.role: Role | None = None
         self.intents = Intents()
         self.episodes = Episodes()
         self.answers = Answers()
-        self.authority_request = 0  #: number of the newest request to acquire or release the authority
-        self.ended = False  #: whether the proxy has disconnected it, so that further packets are ignored
+        self.authority_request = 0  #: number of the newest request for acquiring or releasing the authority
+        self.ended = False  #: whether the proxy has disconnected the application and therefore ignores further packets
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
-        """Count a malformed packet; return whether there are too many within a second."""
+        """Count a malformed packet; return whether there were too many within a second."""
         recent = self._malformed_ns
         too_many = len(recent) == MAX_MALFORMED and now_ns - recent[0] < NS_PER_S
         recent.append(now_ns)
@@ -79,17 +79,17 @@ class Session:
 
 
 class Answers:
-    """The pending requests of one connection, and the answers stored for repeats. Not thread-safe."""
+    """The pending requests of one connection, and the answers that are stored for repeats. Not thread-safe."""
 
     def __init__(self) -> None:
         self.kept: dict[int, bytes] = {}  #: stored answers, by the number of the request
         self._pending: set[int] = set()
-        self._forgotten = 0  # highest request number whose answer was stored but has been dropped
+        self._forgotten = 0  # highest number of a request whose stored answer has been dropped
 
     def begin(self, number: int, most: float) -> tuple[bool, bool]:
-        """Mark a request as pending, unless it is a repeat or ``most`` requests are pending already.
+        """Mark a request as pending, unless it is a repeat or ``most`` requests are already pending.
 
-        Returns whether the request has been or is being executed, and whether the limit has been reached.
+        Returns whether the request has been executed or is being executed, and whether the limit has been reached.
         """
         repeated = number in self._pending or number in self.kept or number <= self._forgotten
         full = not repeated and len(self._pending) >= most
@@ -110,20 +110,20 @@ class Answers:
 
 
 class JobQueue(Protocol):
-    """Runs jobs one after another, on a thread that may be shared with other proxies."""
+    """Runs jobs one after another on a thread that may be shared with other proxies."""
 
     def start(self) -> None:
         """Start running jobs."""
 
     def put(self, job: Callable[[], None]) -> None:
-        """Queue a job, which must not raise. Thread-safe."""
+        """Queue a job. The job must not raise. Thread-safe."""
 
     def stop(self, timeout_s: float) -> None:
-        """Stop after the current job; if that takes longer than this, leave it to its daemon thread."""
+        """Stop after the current job. If the job takes longer than this, leave it to its daemon thread."""
 
 
 class JobThread:
-    """A :class:`JobQueue` with its own thread."""
+    """A :class:`JobQueue` that has its own thread."""
 
     def __init__(self) -> None:
         self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
@@ -154,9 +154,9 @@ Answer = Callable[[Session, Any, int], AnyReply]
 class RequestDispatcher:
     """Answers requests on the receiving thread or the jobs thread, from :meth:`start` to :meth:`stop`.
 
-    ``immediate`` and ``deferred``: the functions for these threads, by type of the request's body. Errors raised by
-    deferred ones become refusals: ``on_failure`` gets the request's name and an unexpected error, and returns the text
-    for the requester.
+    ``immediate`` and ``deferred``: the functions for the two threads, by type of the request's body. Errors raised by
+    deferred requests become refusals. ``on_failure`` is called with the request's name and an unexpected error, and
+    returns the text for the requester.
     """
 
     def __init__(
@@ -181,15 +181,15 @@ class RequestDispatcher:
         self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
-        """End after the current job; a driver that hangs for longer is left to its daemon thread."""
+        """End after the current job. If a driver hangs for longer, leave it to its daemon thread."""
         self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
-        """Run a job, which must not raise, on the requests thread, after those already waiting."""
+        """Run a job on the requests thread, after the jobs that are already waiting. The job must not raise."""
         self._jobs.put(job)
 
     def handle(self, session: Session, request: Request, now_ns: int) -> None:
-        """Answer at once, or later on the requests thread. Called on the receiving thread."""
+        """Answer immediately, or later on the requests thread. Called on the receiving thread."""
         self._counts["requests.received"] += 1
         kind = type(request.body)
         if session.role is None and kind is not Hello:
@@ -234,7 +234,7 @@ class RequestDispatcher:
         self._finish(session, request, reply)
 
     def _finish(self, session: Session, request: Request, body: AnyReply) -> None:
-        """Send an answer, and store it for repeats if the request changed something."""
+        """Send an answer. Store it for repeats if the request changed something."""
         packet = self._reply(session, request, body)
         with self._pending_lock:
             session.answers.end(request.id, packet if isinstance(request.body, _CHANGING) else None)
@@ -259,4 +259,4 @@ def _refusal(code: str) -> Refusal:
     try:
         return Refusal(code)
     except ValueError:
-        return Refusal.DRIVER_FAILED  # a driver's own refusal, with an unknown code
+        return Refusal.DRIVER_FAILED  # a driver refused for a reason of its own, with an unknown code

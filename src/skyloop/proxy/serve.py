@@ -25,22 +25,22 @@ from skyloop.proxy.records import AuditTrail, FlightRecord, audit_path, record_p
 from skyloop.proxy.topics import OverviewRegistry
 from skyloop.transport.base import TransportServer
 
-LAND_WITHIN_S: Final = 20.0  #: how long a proxy waits for its vehicle to land after a signal
-ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: how long a private proxy waits for the landing once its program has gone
+LAND_WITHIN_S: Final = 20.0  #: maximum time that a proxy waits for its vehicle to land after a signal
+ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: time that a private proxy waits for the landing after its program has gone
 _POLL_S: Final = 0.2
-GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; waiting is printed only afterwards
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; a waiting message is printed only later
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 K = TypeVar("K")
 
 #: Returns updates about the network's keys, one sentence each.
 Look = Callable[[], Sequence[str]]
-#: Runs something, such as an endpoint for metrics, alongside the proxies of a process.
+#: Runs an additional service, such as an endpoint for metrics, alongside the proxies of a process.
 Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
 class LinkLines:
-    """Composes the lines for the terminal about a proxy's vehicle link: one per change of the link or its reason."""
+    """Composes the terminal output about a proxy's vehicle link: one line per change of the link or its reason."""
 
     def __init__(self, name: str, where: str, now_ns: int) -> None:
         """Initialise; ``where`` names the vehicle and the address that serves it."""
@@ -51,7 +51,7 @@ class LinkLines:
         self._was_there = False
 
     def first(self, state: LinkState) -> str:
-        """Return the first line, once applications can connect: ``ready`` only if the vehicle answers, too."""
+        """Return the first line once applications can connect. It is ``ready`` only if the vehicle answers, too."""
         self._was_there = state in _THERE
         if self._was_there:
             self._written = state, "", ""
@@ -72,16 +72,16 @@ class LinkLines:
 
 
 class Shutdown:
-    """A request to end a process that runs proxies, and how urgent it is."""
+    """A request to end a process that runs proxies, and how urgent the request is."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
-        self.hurry = threading.Event()  #: set to end without landing first
+        self.hurry = threading.Event()  #: set if the process must end without landing first
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
-        """Request that the process end. Thread-safe, also for signal handlers."""
-        if hurry or self.requested.is_set():  # a second signal means to end at once
+        """Request that the process end. Thread-safe, even for signal handlers."""
+        if hurry or self.requested.is_set():  # a second signal ends the process immediately
             self.hurry.set()
         self.reason = self.reason or reason
         self.requested.set()
@@ -99,16 +99,16 @@ def serve(
     audit: Path | None = None,
     beside: Beside | None = None,
 ) -> None:
-    """Serve a vehicle to this host's applications under a name. Blocks; call on the main thread.
+    """Serve a vehicle to this host's applications under a name. Blocks, and must be called on the main thread.
 
     ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
-    Until then it writes ``serving`` and, at each change, what it is waiting for, the last failure and a remedy (not
-    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s];
-    a second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
-    which occurs when the parent dies, and leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
-    called several times a second; the updates about keys that it returns are logged, and published as an event.
+    Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
+    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s].
+    A second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
+    which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
+    called several times a second. The updates about keys that it returns are logged and published as an event.
 
     Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
@@ -141,11 +141,11 @@ def run(
 ) -> None:
     """Serve several vehicles from one process, such as the drones of one simulated world; see :func:`serve`.
 
-    Starts the proxies, and stops them at the end; writes lines for each, as :func:`serve` does. ``audit``: file for the
-    audit trail; by default each proxy has one in the user's state directory, except private ones (with ``parent_fd``).
-    ``records``: whether to keep an audit trail, and a note about the flight for the next run; by default, private
-    proxies keep none, because they are never restarted under their name. ``beside``: a context entered while the
-    proxies run.
+    Starts the proxies, and stops them at the end. Writes lines for each, as :func:`serve` does. ``audit``: file for the
+    audit trail. By default, each proxy has a file in the user's state directory, except private proxies (those with
+    ``parent_fd``). ``records``: whether to write an audit trail, and a note about the flight for the next run. By
+    default, private proxies write neither, because they are never restarted under their name. ``beside``: a context
+    that is entered while the proxies run.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     shutdown = Shutdown()
@@ -159,7 +159,7 @@ def run(
     overview = OverviewRegistry()
     for proxy in proxies:
         proxy.overview.share(overview)
-    within_s = land_within_s  # a vehicle may be found in flight as soon as its proxy starts
+    within_s = land_within_s  # a vehicle may turn out to be in flight as soon as its proxy starts
     with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as around:
         if beside is not None:
             around.enter_context(beside(proxies))
@@ -169,24 +169,24 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            # A private proxy is never restarted, and no one could fly a vehicle that it leaves in the air.
+            # A private proxy is never restarted, so no one could fly a vehicle that it leaves in the air.
             on_parent_end(partial(shutdown.request, "its parent process ended", hurry=records), parent_fd)
             if not records:
                 within_s = max(within_s, ORPHAN_LANDS_WITHIN_S)
         lines = [_announced(proxy) for proxy in proxies]
-        # Wake periodically, because a signal delivered to another thread does not wake this one.
+        # Wake up periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
                 _log.warning("%s", change)
                 for proxy in proxies:
                     proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
-            if parent_fd is None:  # a parent gets the proxy's events, and might not read this output
+            if parent_fd is None:  # a parent process gets the proxy's events, and may not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Give a proxy its audit trail; :class:`UsageError` if it can't be written to ``path``, if given."""
+    """Give a proxy its audit trail. Raises :class:`UsageError` if a ``path`` is given that can't be written to."""
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -197,9 +197,9 @@ def keep_trail(proxy: Proxy, path: Path | None) -> None:
 
 
 def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Callable[[], bool]) -> None:
-    """End several proxies at the same time with :meth:`Proxy.end`, then raise the first of their errors.
+    """End several proxies at the same time with :meth:`Proxy.end`. Then raise the first of their errors.
 
-    Ctrl-C, unless it is handled elsewhere, ends the wait for landings, and is raised when all have ended.
+    Ctrl-C ends the wait for landings unless it is handled elsewhere, and is raised again when all have ended.
     """
     raised: list[Exception] = []
     with interrupt_deferred() as interrupted:
@@ -228,12 +228,12 @@ def at_once(
     """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
     ``tell``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
-    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may end before they do.
+    returns whether to stop waiting for the end with this key. ``daemon``: whether the program may exit before they end.
     """
     threads: dict[K, threading.Thread] = {}
     for one, end in ends.items():
         thread = threading.Thread(target=end, name="skyloop-end", daemon=daemon)
-        with suppress(RuntimeError):  # no thread is available, so it is run below
+        with suppress(RuntimeError):  # no thread is available, so the job runs below
             thread.start()
             threads[one] = thread
     left = [one for one in ends if one not in threads]
@@ -245,13 +245,13 @@ def at_once(
     for one in left:
         ends[one]()
     for one, thread in threads.items():
-        while thread.is_alive() and not over(one):  # wake periodically to handle signals
+        while thread.is_alive() and not over(one):  # wake up periodically to handle signals
             thread.join(_POLL_S)
 
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end. Main thread only."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end of the process. Main thread only."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
@@ -288,5 +288,5 @@ def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
 
 
 def _announce(line: str) -> None:
-    with suppress(OSError):  # standard output has no reader: keep serving
+    with suppress(OSError):  # no one reads standard output: continue serving
         print(line, flush=True)

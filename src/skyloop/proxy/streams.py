@@ -1,8 +1,8 @@
 """Encode H.264 as subscribers request it: each format once, on a separate thread, for all of its subscribers.
 
-A format with a fixed rate is shared by all that request it. A format named after a subscriber is for that subscriber
-alone; its rate and size adapt to the path, judged by acknowledgements (:mod:`skyloop.proxy.core.stream_rate`). If the
-vehicle itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
+A format with a fixed rate is shared by all who request it. A format named after a subscriber is for that subscriber
+alone. The rate and size of such a format adapt to the path (:mod:`skyloop.proxy.core.stream_rate`). If the vehicle
+itself sends H.264, such a stream forwards it while the path can carry it, and is otherwise encoded here.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from skyloop.transport.frame_encoding import resized_header
 
 MAX_FORMS: Final = 16  #: maximum number for all cameras together, because each needs its own encoder
 KEY_NS: Final = nanoseconds(0.3)  #: minimum time between requests for key frames
-IDLE_S: Final = 1.0  #: a stream ends its thread after this time without subscribers
-GOOD_BITS: Final = 0.2  #: bits per pixel beyond which images hardly improve
+IDLE_S: Final = 1.0  #: a stream's thread ends after this time without subscribers
+GOOD_BITS: Final = 0.2  #: number of bits per pixel beyond which images hardly improve
 _FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
-_FPS: Final = 30.0  # assumed rate of cameras that do not announce one
+_FPS: Final = 30.0  # assumed frame rate of cameras that do not announce one
 _BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the image, because each change costs a key frame
-#: Fraction of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
+#: Fractions of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
-#: If they overload the path, they are retried after this time, which doubles with each failure.
+#: If they overload the path, they are retried after this time. The time doubles with each failure.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # highest rate tried for the vehicle's own stream [kbit/s]
@@ -55,7 +55,7 @@ class _Picture:
 
 
 class StreamForm:
-    """One camera's H.264 in one format; ``publish`` is called on its thread, and ``fail`` with a readable reason."""
+    """One camera's H.264 in one format. The form's thread calls ``publish``, or ``fail`` with a readable reason."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class StreamForm:
         self.topic = topic
         self.request = request
         self.asked_ns = 0
-        self.skipped = 0  #: number of frames not encoded, because the path or the encoder was busy
+        self.skipped = 0  #: number of frames that were not encoded because the path or the encoder was busy
         self._fps = camera.fps if camera.fps > 0.0 else _FPS
         if request.max_fps is not None:
             self._fps = min(self._fps, request.max_fps)
@@ -83,8 +83,8 @@ class StreamForm:
         self._rate = StreamRate(most_kbit_s, clock()) if request.subscriber else None
         #: Whether the vehicle's own stream may be forwarded.
         self.takes_own = own and self._rate is not None
-        self._passing = False  # whether that stream is being forwarded, as long as its frames keep arriving
-        self._own_ns = 0  # when its newest frame arrived
+        self._passing = False  # whether that stream is being forwarded; True only while its frames keep arriving
+        self._own_ns = 0  # time at which its newest frame arrived
         self._limiter = RateLimiter(request.max_fps)
         self._scale, self._better_ns = request.scale, clock()
         self._changed = threading.Condition()  # guards everything below, and the rate
@@ -96,19 +96,19 @@ class StreamForm:
         self._ended = False
         self._encoder: H264Encoder | None = None
         self._needs_encoder = False  # whether a new encoder is needed
-        self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0: unknown
+        self._own_kbit_s = 0.0  # rate of the vehicle's own stream; 0 if unknown
         self._own_bytes, self._own_since_ns = 0, 0
         self._try_ns, self._again_ns = 0, _TRY_AGAIN_NS
-        self._seq = clock() // 1_000_000  # a time, so that a recreated stream continues with higher numbers
+        self._seq = clock() // 1_000_000  # the current time, so that a recreated stream continues with higher numbers
 
     @property
     def passing(self) -> bool:
-        """Whether the vehicle's own stream is being forwarded; False if the vehicle has stopped sending it."""
+        """Whether the vehicle's own stream is being forwarded; False if the vehicle has stopped sending the stream."""
         return self._passing and self._clock() - self._own_ns < _OWN_SILENT_NS
 
     @property
     def max_fps(self) -> float:
-        """Maximum rate at which the stream uses frames; infinity if it uses all."""
+        """Maximum rate at which the stream uses frames; infinity if it uses all of them."""
         return self._limiter.max_hz
 
     def _encode_again(self) -> None:
@@ -123,13 +123,13 @@ class StreamForm:
                 self._rate.forget()
 
     def wants(self, header: FrameHeader, subscribers: int) -> bool:
-        """Return whether to encode a frame. Call it once per frame, on the thread that publishes it."""
+        """Return whether a frame must be encoded. Call it once per frame, on the thread that publishes it."""
         with self._changed:
             self._wants_key = self._wants_key or subscribers > self._subscribers
             self._subscribers = subscribers
             if not subscribers or self.passing:
                 return False
-            if self._passing:  # the vehicle has stopped sending
+            if self._passing:  # the vehicle has stopped sending the stream
                 self._encode_again()
             if self._rate is not None and not self._rate.may_send(self._clock()):
                 self.skipped += 1
@@ -137,7 +137,7 @@ class StreamForm:
             return self._limiter.in_time(header.captured_ns)
 
     def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for encoding, replacing a waiting one; its bytes must not change afterwards."""
+        """Queue a frame for encoding. It replaces a frame that is waiting, and its bytes must not change afterwards."""
         with self._changed:
             if self._ended:
                 return
@@ -150,7 +150,7 @@ class StreamForm:
             self._changed.notify()
 
     def report(self, report: StreamReport, now_ns: int) -> None:
-        """Handle a subscriber's report: its newest frame, and whether it needs a key frame."""
+        """Handle a subscriber's report, which gives its newest frame and whether it needs a key frame."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
             # A number that this stream never sent would distort the measurement of the path.
@@ -167,7 +167,7 @@ class StreamForm:
                 self._passing = False
                 return None
             fits = rate.may_send(now_ns)
-            # Each frame refers to the previous one; after skipping one, encode until the vehicle's next key frame.
+            # Each frame refers to the previous one. After a skipped frame, encode until the vehicle's next key frame.
             if self._passing and (self._wants_key or not fits or self._own_kbit_s > _KEEP_SHARE * rate.kbit_s):
                 if not self._wants_key:  # the stream overloaded the path
                     self._try_ns = now_ns + self._again_ns
@@ -186,13 +186,13 @@ class StreamForm:
         self._own_bytes += size
         passed_ns = now_ns - self._own_since_ns
         if passed_ns >= _MEASURE_NS:
-            # After a pause, the average would be too low, so start a new measurement instead.
+            # After a pause, the average would be too low, so a new measurement starts instead.
             if passed_ns < 2 * _MEASURE_NS:
                 self._own_kbit_s = self._own_bytes * 8e6 / passed_ns
             self._own_bytes, self._own_since_ns = 0, now_ns
 
     def end(self) -> None:
-        """End the thread, and wait for its current frame."""
+        """End the thread after its current frame, and wait for it."""
         with self._changed:
             self._ended = True
             self._changed.notify()
@@ -212,7 +212,7 @@ class StreamForm:
     def _next(self) -> _Picture | None:
         with self._changed:
             if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
-                # This thread holds the lock, so a later put() starts another thread.
+                # This thread holds the lock, so a later put() will start another thread.
                 self._thread = None
                 self._encoder = None
                 self._wants_key = True
@@ -242,7 +242,7 @@ class StreamForm:
             raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
         with self._changed:
             if self._passing:
-                return  # the vehicle's own stream has replaced it
+                return  # the vehicle's own stream has replaced this one
             self._seq += 1
             seq = self._seq
             if is_key:
@@ -255,7 +255,7 @@ class StreamForm:
         )
 
     def _follow_path(self, header: FrameHeader) -> int:
-        """Choose the rate, and the size and frame rate that match it; return the rate [kbit/s]."""
+        """Choose the rate, and the frame size and frame rate that match it; return the rate [kbit/s]."""
         if self._rate is None:
             return self._kbit_s
         now_ns = self._clock()
@@ -285,7 +285,7 @@ class Streams(Forms[StreamForm]):
         self._fail = fail
 
     def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
-        """Return why a format can't be subscribed to, or reserve a place for it and return "". Thread-safe."""
+        """Reserve a place for a format and return ""; if it can't be subscribed to, return the reason. Thread-safe."""
         if request.kbit_s is None and not request.subscriber:
             return (
                 f"{topic[:100]!r} has no rate: add kbit_s=…, or subscriber=NAME for as much as the path to one "
@@ -320,7 +320,7 @@ class Streams(Forms[StreamForm]):
         )
 
     def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
-        """Queue a frame for the streams that need it, copying it once if any do."""
+        """Queue a frame for the streams that need it. The frame is copied once if any stream does."""
         camera = header.camera
         wanted = [
             form
@@ -334,7 +334,7 @@ class Streams(Forms[StreamForm]):
             form.put(header, copy)
 
     def own(self, picture: EncodedFrame) -> None:
-        """Publish a frame encoded by the vehicle, unchanged and in the streams that forward it."""
+        """Publish a frame that the vehicle encoded, both unchanged and in the streams that forward it."""
         self.publish(picture)
         for form in self.known:
             if form.takes_own and form.request.camera == picture.camera:
@@ -343,14 +343,14 @@ class Streams(Forms[StreamForm]):
                     self.publish(sent)
 
     def report(self, report: StreamReport) -> str:
-        """Handle a subscriber's report; return why it makes no sense, or an empty string."""
+        """Handle a subscriber's report. Return why it makes no sense, or an empty string."""
         if (form := self.find(report.topic)) is not None:
             form.report(report, self._clock())
             return ""
         return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is not a stream"
 
     def publish(self, picture: EncodedFrame) -> None:
-        """Publish a frame in as many packets as it needs. Thread-safe."""
+        """Publish a frame, split into as many packets as needed. Thread-safe."""
         camera, missed = picture.camera, 0
         for piece in split(picture):
             missed = max(missed, self._publish_packet(picture.topic or f"stream/{camera}", encode(piece)))
@@ -364,7 +364,7 @@ class Streams(Forms[StreamForm]):
 
 
 def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
-    """Return width and height of the encoded image [px], which are even because colours have half the resolution."""
+    """Return the width and height of the image [px]. Both are even, as colours have half the resolution."""
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 

@@ -1,11 +1,11 @@
-"""React to time, links and the authority during a flight; every decision about it is made under one lock.
+"""React to time, links and the authority during a flight. Every decision about the flight is made under one lock.
 
 The lock is also held while the driver is called. The transport's threads deliver commands and requests for the
-authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions themselves are pure, in
+authority (:mod:`skyloop.proxy.handler`), and the ticker supplies the time. The decisions are pure functions in
 :mod:`skyloop.proxy.core`.
 
-Lock order: this lock first, then the publisher's, then the events'. Nothing called under the last two locks calls back
-into this module; a driver publishes what it receives on any thread without this lock.
+Lock order: this lock first, then the publisher's lock, then the lock of the events. Nothing that is called under the
+last two locks calls back into this module. A driver publishes what it receives on any thread without this lock.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ from skyloop.proxy.requests import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
-_NOTICED_M_S: Final = 0.05  #: reductions of the software autopilot's steps that are smaller than this are not reported
-#: Minimum additional sleep time of the computer that is handled; less can't be distinguished from a delay.
+_NOTICED_M_S: Final = 0.05  #: software autopilot set-points that are reduced by less than this are not reported
+#: Minimum additional sleep time of the computer that is handled. A shorter sleep can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
 class FlightSupervisor:
     """Supervises the authority, failsafe and ownership of one vehicle. Public methods are thread-safe.
 
-    ``sessions``: the connections by application number, read here and changed by the proxy. ``slept``: returns how long
-    the computer has slept in total [ns].
+    ``sessions``: the connections by application number. They are read here, and only the proxy changes them. ``slept``:
+    returns how long the computer has slept in total [ns].
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class FlightSupervisor:
             why_not=executor.why_not,
             native=executor.native,
         )
-        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock; True: the flight is ours
+        self.on_ownership: Callable[[bool], None] | None = None  #: called under the lock; True if it is the proxy's
         self._returns = ReturnSupervisor(self.checks, self.ladder, executor)
         self._lock = threading.RLock()
         self._executor = executor
@@ -110,23 +110,23 @@ class FlightSupervisor:
         self._sessions = sessions
         self._clock = clock
         self._left = False  # the proxy is ending, and makes no more decisions about the flight
-        self._pilot = "none"  # "held", or why the authority has no holder
-        self._breaks_seen = 0  # number of breaks of the vehicle link at the last check
-        self._heard_ns = -LATEST_NS  # time of the last tick that found the vehicle link up
+        self._pilot = "none"  # "held", or the reason why the authority has no holder
+        self._breaks_seen = 0  # number of times that the vehicle link had broken at the last check
+        self._heard_ns = -LATEST_NS  # time of the last tick at which the vehicle link was up
         self._slept = slept
-        self._slept_seen = slept()  # value at the last check
-        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and when it ended
+        self._slept_seen = slept()  # time the computer had slept in total at the last check
+        self._slept_ns, self._awake_ns = 0, -LATEST_NS  # duration of the last sleep, and the time when it ended
         #: Deadline for a take-off that was sent but has had no visible effect yet; None if there is none.
         self._rising_until_ns: int | None = None
         self._drifts = False  # whether the software autopilot drifts, as last reported
-        self._enforced = True  # whether the safety box and zones could be enforced at the last set-point
-        self._episodes = Episodes()  # episodes in which limits reduced the proxy's own actions, without a pilot
+        self._enforced = True  # whether safety box and zones could be enforced at the last set-point
+        self._episodes = Episodes()  # episodes in which limits reduced actions of the proxy itself, without a pilot
         if executor.autopilot is not None:
             executor.autopilot.guard = self._guard_step
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
-        """Start the run, before the server starts. A flight from an earlier run waits for its pilot."""
+        """Start the run, before the server starts. A flight from an earlier run waits until its pilot returns."""
         self.authority.last_command_ns = now_ns
 
     def tick(self, now_ns: int) -> None:
@@ -171,8 +171,8 @@ class FlightSupervisor:
     def _observe_link(self, now_ns: int) -> None:
         """React to changes of the vehicle link since the last call.
 
-        Intents end when the link breaks and again when it returns, so that no old command is executed later. Both times
-        a hover is sent, because a driver must not continue an old set-point. A landing continues.
+        Intents end when the link breaks, and again when it returns, so that no old command is executed later. A hover
+        is sent both times, because a driver must not continue an old set-point. A landing in progress continues.
         """
         breaks = self._publisher.link_breaks
         if breaks == self._breaks_seen:
@@ -189,10 +189,10 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_silence(self, now_ns: int) -> None:
-        """Abandon a hover or landing if the vehicle has long been silent, because it may be on another flight by then.
+        """Give up a hover or landing after a long silence of the vehicle, because it may be on another flight by then.
 
-        After a landing by the ladder, a vehicle found in the air belongs to others at once, because there is no pilot
-        to claim it. Otherwise, this is decided once the vehicle is received again, because its pilot may be present.
+        After a landing by the ladder, a vehicle found in the air counts as flown by others at once, because there is
+        no pilot to claim it. Otherwise, this is decided when the vehicle answers, because its pilot may be present.
         """
         if self._publisher.link_up:
             self._heard_ns = now_ns
@@ -215,7 +215,7 @@ class FlightSupervisor:
         self._update_failsafe(now_ns)
 
     def _observe_sleep(self, now_ns: int) -> None:
-        """React to the computer having slept, after which everything is older than its timestamp suggests."""
+        """Handle the computer having slept, because all data is then older than its timestamp suggests."""
         slept_ns = self._slept() - self._slept_seen
         if slept_ns < SLEEP_NS:
             return
@@ -227,7 +227,7 @@ class FlightSupervisor:
         self._start_over(Fate.SLEPT, now_ns)
 
     def _observe_position(self, now_ns: int) -> None:
-        """Update the vehicle's position; hover if it has jumped, because the request assumed the old position."""
+        """Update the vehicle's position. Hover if it has jumped, because the request was based on the old position."""
         airspace = self.checks.airspace
         airspace.observe(self._publisher.feedback_now)
         if not airspace.jumped_m:
@@ -250,7 +250,7 @@ class FlightSupervisor:
         """Observe the vehicle, and react if its flight has changed hands."""
         executor, flight = self._executor, self.flight
         changed = executor.observe(now_ns)
-        if self.on_ownership is not None and not flight.awaited:  # otherwise the note stays unchanged
+        if self.on_ownership is not None and not flight.awaited:  # otherwise the note remains as it is
             self.on_ownership(flight.ours)
         if changed is not None:
             self._stamp()
@@ -258,9 +258,9 @@ class FlightSupervisor:
                 executor.stop_autopilot()
                 why = f"{flight.others}: hover, take off or land first to take it over"
                 self._end_intents(Fate.OTHERS, now_ns, why, Refusal.WRONG_STATE)
-            elif changed.why:  # our own flight has turned up, and its pilot may return: measure the silence from now
+            elif changed.why:  # our own flight was found, and its pilot may return: restart the silence
                 self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
-            if changed.why and executor.supported:  # a replay has no pilot to surprise
+            if changed.why and executor.supported:  # a replay has no pilot who might be surprised
                 self._events.publish_drafts(ownership_event(changed))
         return executor.seen(now_ns)
 
@@ -273,7 +273,7 @@ class FlightSupervisor:
         return None if holder is None else self._sessions.get(holder.app_id)
 
     def _asked(self, *kinds: type[Action]) -> Intent | None:
-        """Return the holder's intent if it is in progress and of one of these kinds."""
+        """Return the holder's intent if it is in progress and is of one of these kinds."""
         session = self._holder
         newest = None if session is None else session.intents.newest
         return newest if newest is not None and type(newest.action) in kinds and not newest.over else None
@@ -287,11 +287,11 @@ class FlightSupervisor:
         self._withdraw_takeoff(now_ns)
 
     def _observe_intent(self, session: Session, now_ns: int) -> FlightState:
-        """End or complete the holder's intent according to the vehicle's actions; return the flight state."""
+        """End or complete the holder's intent, based on the vehicle's actions; return the flight state."""
         state, intent = self._executor.state, session.intents.newest
         if not intent.over:
             if state is not intent.state:
-                self._observe_vehicle(now_ns)  # others may have landed the vehicle, which would have ended the intent
+                self._observe_vehicle(now_ns)  # others may have landed the vehicle, which ends the intent
             feedback = self._publisher.feedback_now
             intent.observe(state, now_ns, None if feedback is None else feedback.captured_ns)
             if intent.over:
@@ -304,23 +304,23 @@ class FlightSupervisor:
         return self._executor.state
 
     def _observe_takeoff(self, now_ns: int) -> None:
-        """Withdraw a take-off past its deadline, even if a set-point has replaced it."""
+        """Withdraw a take-off that is past its deadline, even if a set-point has replaced it."""
         if self._rising_until_ns is not None and not self._executor.stands:
-            self._rising_until_ns = None  # it has left the ground
+            self._rising_until_ns = None  # the vehicle has left the ground
         elif self._rising_until_ns is not None and now_ns >= self._rising_until_ns:
             self._withdraw_takeoff(now_ns)
 
     def _withdraw_takeoff(self, now_ns: int) -> bool:
-        """Cancel a take-off that has had no visible effect yet; return whether there was one.
+        """Cancel a take-off that has had no visible effect yet. Return whether a take-off was cancelled.
 
-        A landing sent to a vehicle on the ground cancels an arming that is still in progress.
+        A landing command sent to a vehicle on the ground cancels an arming that is still in progress.
         """
         until_ns, self._rising_until_ns = self._rising_until_ns, None
         if until_ns is None or not self._executor.stands or self.flight.whose is Whose.OTHERS:
             return False
         if self._executor.attempt(_LAND, now_ns, "apply"):
             self.flight.call_off(now_ns)
-        elif self.flight.ours:  # retry while that take-off may still take effect
+        elif self.flight.ours:  # retry while the earlier take-off may still take effect
             self._rising_until_ns = now_ns + nanoseconds(self.ladder.settings.retry_s)
         return True
 
@@ -337,7 +337,7 @@ class FlightSupervisor:
     def _report_limits(
         self, session: Session | None, clamps: tuple[Clamp, ...], enforced: bool | None, now_ns: int
     ) -> None:
-        """Publish limits that begin to affect this application's commands, or the proxy's own actions."""
+        """Publish the limits that begin to affect this application's commands, or the proxy's own actions."""
         if enforced is not None and enforced is not self._enforced:
             self._enforced = enforced
             self._events.publish_drafts(enforcement_event(enforced))
@@ -346,7 +346,7 @@ class FlightSupervisor:
             self._events.publish_drafts(clamped_event(name, clamp))
 
     def _guard_step(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
-        """Return the nearest velocity that the limits, safety box and zones allow for the software autopilot's step."""
+        """Return the velocity nearest to the software autopilot's that limits, safety box and zones allow."""
         allowed, found, _, _, enforced = self.checks.airspace.step(wanted, feedback, now_ns)
         clamps = tuple(clamp for clamp in found if clamp.asked - clamp.applied > _NOTICED_M_S)
         if clamps or (enforced is not None and enforced is not self._enforced):
@@ -357,7 +357,7 @@ class FlightSupervisor:
     # Authority ----------------------------------------------------------------------------------------------------
 
     def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Hover while the authority changes hands, then publish the events in ``news`` and the changes."""
+        """Hover while the authority changes hands. Then publish the events in ``news`` and the changes."""
         for effect in effects:
             if not isinstance(effect, Lost | Preempted | Granted):
                 continue
@@ -381,7 +381,7 @@ class FlightSupervisor:
         self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:
-        """Update the holder, the failsafe's step and the flight's owner in feedback."""
+        """Update the holder, the failsafe's step and the flight's owner in the feedback."""
         authority, flight = self.authority, self.flight
         owner = authority.holder or authority.silent
         waiting = authority.waiting
@@ -407,16 +407,16 @@ class FlightSupervisor:
             self._events.publish_drafts(*drafts)
 
     def _act(self, now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Let the ladder decide and act; return the events to publish. ``stamps``: whether the holder has changed."""
+        """Let the ladder decide and act. Return the events to publish. ``stamps``: whether the holder has changed."""
         if self._left:
             return []
         ladder, flight = self.ladder, self.flight
         seen = self._observe_vehicle(now_ns)
-        # An abandoned flight may be a different one by now, unless the software autopilot kept steering, or it lands.
+        # An abandoned flight may be a different one by now, unless the autopilot kept steering or the ladder lands.
         if seen.link_up and ladder.given_up and not ladder.lands and Hover in self._executor.native and flight.forget():
             seen = self._observe_vehicle(now_ns)
         if not seen.link_up and (landing := self._asked(Land)) is not None and landing.begun:
-            ladder.continue_landing(now_ns)  # a hover must not interrupt its pilot's landing
+            ladder.continue_landing(now_ns)  # a hover must not interrupt the landing that its pilot requested
         inputs = FailsafeInputs(
             state=seen.state,
             airborne=flight.flies(seen.state),
@@ -432,7 +432,7 @@ class FlightSupervisor:
         return self._apply_failsafe(effects, now_ns, stamps=stamps) if effects or stamps else []
 
     def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int, *, stamps: bool = False) -> list[EventDraft]:
-        """Execute the ladder's decisions; return the events to publish afterwards, because publishing takes time."""
+        """Execute the ladder's decisions. Return the events to publish afterwards, because publishing takes time."""
         if stamps or any(isinstance(effect, StepChange) for effect in effects):
             self._stamp()
         drafts = []

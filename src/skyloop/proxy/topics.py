@@ -1,6 +1,6 @@
 """A proxy's topics: their names, feedback at reduced rates, and the overview.
 
-No other topics can be subscribed to, so that made-up names cost nothing.
+No other topics can be subscribed to, so that made-up names use no resources.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from skyloop.transport.base import (
     video,
 )
 
-#: Topics that don't contain a name.
+#: The topics whose names never change.
 PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
 PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
-MAX_VARIANTS: Final = 16  #: maximum number of simultaneous variants of feedback, each with any number of subscribers
+MAX_VARIANTS: Final = 16  #: maximum number of simultaneous feedback variants, each with any number of subscribers
 #: How long a requested variant keeps its place without subscribers, because a subscription may be in transit.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
-_FRESH_NS: Final = PERIOD_NS // 2  # an overview younger than this is sent again instead of a new one
+_FRESH_NS: Final = PERIOD_NS // 2  # if an overview is younger than this, it is sent again instead of a new one
 _replace = msgspec.structs.replace
 
 
 def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
-    """Return why a topic can't be subscribed to, naming the available ones; an empty string if it can be.
+    """Return why a topic can't be subscribed to, and name the available topics; an empty string if it can.
 
     A processor's results may be subscribed to before it has a worker.
     """
@@ -75,7 +75,7 @@ def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
 
 
 class Form(Protocol):
-    """A variant of samples, published on one topic."""
+    """A variant of samples that is published on one topic."""
 
     topic: str
     asked_ns: int  #: time of the newest request for this variant
@@ -85,21 +85,21 @@ F = TypeVar("F", bound=Form)
 
 
 class Forms(Generic[F]):
-    """A limited number of variants that have, or may soon have, subscribers. Thread-safe."""
+    """A limited number of variants that have subscribers or may soon have some. Thread-safe."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
         self.known: tuple[F, ...] = ()
         self._most = most
         self._subscribers = subscribers
         self._clock = clock
-        self._lock = threading.Lock()  # guards changes of the known variants
+        self._lock = threading.Lock()  # guards changes to the set of known variants
 
     def find(self, topic: str) -> F | None:
-        """Return the variant of a topic; None if it was never requested."""
+        """Return the variant of a topic; None if no one has requested it."""
         return next((form for form in self.known if form.topic == topic), None)
 
     def claim(self, topic: str, make: Callable[[], F]) -> bool:
-        """Reserve a place for a variant, or renew it; return False if all places are taken."""
+        """Reserve a place for a variant, or renew the reservation. Return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
             form = self.find(topic)
@@ -124,7 +124,7 @@ class _Variant:
 
 
 class FeedbackVariants(Forms[_Variant]):
-    """The variants of feedback that have, or may soon have, subscribers."""
+    """The variants of feedback that have subscribers or may soon have some."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock) -> None:
         super().__init__(MAX_VARIANTS, server.subscribers, clock)
@@ -132,7 +132,7 @@ class FeedbackVariants(Forms[_Variant]):
         self._counts = counters.counts
 
     def problem(self, topic: str) -> str:
-        """Return why a variant can't be subscribed to; if it can, reserve its place and return "". Thread-safe."""
+        """Reserve a place for a variant and return ""; if it can't be subscribed to, return the reason. Thread-safe."""
         try:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
@@ -145,9 +145,9 @@ class FeedbackVariants(Forms[_Variant]):
         )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
-        """Publish a sample in each variant for which it is due. One thread at a time.
+        """Publish a sample in each variant that is due. Not thread-safe.
 
-        ``now_ns`` is not the capture time, which does not advance while the vehicle is silent.
+        ``now_ns`` must not be the capture time, which does not advance while the vehicle is silent.
         """
         for variant in self.known:
             if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
@@ -157,7 +157,7 @@ class FeedbackVariants(Forms[_Variant]):
             selected = _replace(sample, skipped=skipped)
             try:
                 packet = encode(selected)
-            except (ValueError, TypeError, OverflowError):  # due to native telemetry, and reported already
+            except (ValueError, TypeError, OverflowError):  # caused by native telemetry, and already reported
                 packet = encode(_replace(selected, native=None))
             missed = self._publish(variant.topic, packet)
             self._counts["feedback.selected"] += 1
@@ -169,7 +169,7 @@ class FeedbackVariants(Forms[_Variant]):
 
 
 class OverviewRegistry:
-    """The rows of all proxies in a process, encoded once for all of them. Thread-safe."""
+    """The rows of all proxies in a process, encoded once and shared by all of them. Thread-safe."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -179,13 +179,13 @@ class OverviewRegistry:
         self._packets: list[bytes] = []
 
     def add(self, row: Callable[[], VehicleOverview]) -> None:
-        """Add a vehicle; ``row`` returns its row and is called on any proxy's ticker."""
+        """Add a vehicle. ``row`` returns the vehicle's row and is called on any proxy's ticker."""
         with self._lock:
             self._sources[row] = None
             self._made_ns = None
 
     def remove(self, row: Callable[[], VehicleOverview]) -> None:
-        """Remove a vehicle. Does nothing if it is unknown."""
+        """Remove a vehicle. Does nothing if the vehicle is unknown."""
         with self._lock:
             self._sources.pop(row, None)
             self._made_ns = None
@@ -203,19 +203,19 @@ class OverviewRegistry:
 
 
 class OverviewPublisher:
-    """Publishes the overview on one proxy's transport once a second, and at once to a new subscriber."""
+    """Publishes the overview on one proxy's transport once a second, and immediately to a new subscriber."""
 
     def __init__(self, server: TransportServer, row: Callable[[], VehicleOverview]) -> None:
-        self.registry = OverviewRegistry()  #: provides the published rows; by default only the proxy's own
+        self.registry = OverviewRegistry()  #: provides the published rows; by default, only the proxy's own row
         self._server = server
         self._row = row
         self._subscribers = 0
         self._due_ns = 0
 
     def share(self, registry: OverviewRegistry) -> None:
-        """Publish the rows of other proxies, too, and share this one's. Call before :meth:`begin`.
+        """Publish the rows of other proxies, too, and share this proxy's row. Call before :meth:`begin`.
 
-        Does nothing if applications may have access to one proxy but not another, because they would see all rows.
+        Does nothing if applications may have access to only some of the proxies, because they would see all rows.
         """
         if not self._server.restricted:
             self.registry = registry
@@ -238,7 +238,7 @@ class OverviewPublisher:
 
 
 def _encoded(page: Overview) -> list[bytes]:
-    """Encode rows as one packet, or as several if they don't fit."""
+    """Encode rows as one packet, or as several if they don't fit into one."""
     try:
         return [encode(page)]
     except ValueError:

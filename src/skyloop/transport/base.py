@@ -1,11 +1,11 @@
 """The contract for all transports.
 
 A transport carries whole packets between one proxy (the *transport server*) and any number of applications (*transport
-clients*). It knows packets and topics, but not their meaning. An implementation must pass the tests in
+clients*). The transport knows packets and topics, but not their meaning. An implementation must pass the tests in
 :mod:`skyloop.transport.conformance`.
 
-- No call ever blocks on the other end. A packet that does not fit at that moment is not sent, and the caller gets
-  False.
+- No call ever blocks on the other end. A packet that does not fit into the buffer at that moment is not sent, and the
+  caller gets False.
 - A packet arrives whole or not at all. Packets of one connection keep their order. A packet has 1 to
   :data:`MAX_PACKET` bytes; sending any other raises :class:`skyloop.errors.UsageError`.
 - Handlers run on the transport's receiving threads, one call at a time per end, so they must return quickly. A handler
@@ -34,7 +34,7 @@ EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands received by the proxy
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: log entries of applications (LogEntry)
-OVERVIEW = "overview"  #: one row for each vehicle of the proxy's process, once a second (Overview)
+OVERVIEW = "overview"  #: one row for each vehicle in the proxy's process, once a second (Overview)
 MAX_TOPIC = 200  #: maximum number of characters in a topic's name
 MAX_SUBSCRIPTIONS = 64  #: maximum number of simultaneous topics per connection
 RESULTS = "results"  #: results of all processors (ProcessorResult)
@@ -58,13 +58,13 @@ def results(processor: str) -> str:
 
 _UINT8 = np.dtype(np.uint8)
 
-#: Bytes of a frame: shape (size,), uint8, not writeable. They stay unchanged while any view of them exists.
+#: A frame's bytes: shape ``(size,)``, uint8, not writeable. The pixels stay unchanged while any view of them exists.
 Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """The transport server's view of an application's connection."""
+    """What the transport server knows about an application's connection."""
 
     id: int  #: unique in this run of the transport server, from 1
     address: str  #: readable address: process id and user, or host and port
@@ -74,32 +74,32 @@ NOBODY = Peer(0, "an unknown application")
 
 
 class ServerHandler(Protocol):
-    """The callbacks of a transport server, on its receiving threads, one at a time except :meth:`topic_problem`."""
+    """A server's callbacks. They run on its receiving threads, one at a time except for :meth:`topic_problem`."""
 
     def peer_joined(self, peer: Peer) -> None:
-        """Handle a new connection, before its first packet. Later calls identify it by an equal ``Peer``."""
+        """Handle a new connection, before its first packet. Later calls identify the peer by an equal ``Peer``."""
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """Handle a packet from an application: 1 to :data:`MAX_PACKET` bytes, whose content is not checked."""
+        """Handle a packet from an application. It has 1 to :data:`MAX_PACKET` bytes, and its content is not checked."""
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Handle a packet dropped because the sender's keys forbid it; :data:`NOBODY`: an unknown sender."""
+        """Handle a packet that was dropped because its sender's keys forbid it. :data:`NOBODY`: an unknown sender."""
 
     def topic_problem(self, topic: str) -> str:
-        """Return why there is no such topic, and which topics there are; empty if it can be subscribed to.
+        """Return why a topic can't be subscribed to, and which topics exist; empty if it can.
 
-        May be called on any thread, even while another callback runs, and must answer at once.
+        May be called on any thread, even while another callback runs, and must return at once.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
-        """Handle a request for an unknown topic, or for more topics than allowed; ``reason`` is readable text."""
+        """Handle a request for an unknown topic, or for more topics than are allowed. ``reason`` is readable text."""
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """Handle the end of a connection and its reason, once for each ``peer_joined``, after the last packet."""
+        """Handle the end of a connection. Called once for each ``peer_joined``, after the last packet."""
 
 
 class TransportServer(ABC):
-    """A proxy's side of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
+    """A proxy's end of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
@@ -114,26 +114,26 @@ class TransportServer(ABC):
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send a packet to one application; return False if it has gone or its buffer is full."""
+        """Send a packet to one application. Return False if the application has left or its buffer is full."""
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send a packet to every subscriber of a topic; return the number of those that did *not* receive it."""
+        """Send a packet to every subscriber of a topic; return the number of subscribers that did *not* receive it."""
 
     @abstractmethod
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Send a frame to every subscriber of its camera; return the number of those that did *not* receive it.
+        """Send a frame to every subscriber of its camera; return the number of subscribers that did *not* receive it.
 
-        ``pixels``: ``header.size`` bytes, dtype uint8, any shape, C-contiguous, otherwise :class:`UsageError` is
-        raised; they may be reused after the call.
+        ``pixels``: ``header.size`` bytes of dtype uint8, in any shape, C-contiguous. Otherwise :class:`UsageError` is
+        raised. The pixels may be reused after the call.
         """
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers; samples need not be produced if there are none."""
+        """Return the number of a topic's subscribers. If a topic has no subscribers, samples need not be produced."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
-        """Return why an application that has identified itself may not stay; empty if it may, which is the default.
+        """Return why an application that has identified itself must leave; empty if it may stay (the default).
 
         Some places may be reserved for pilots.
         """
@@ -141,7 +141,7 @@ class TransportServer(ABC):
 
     @abstractmethod
     def disconnect(self, peer: Peer, reason: str) -> None:
-        """End one connection; ``peer_left`` and the application get the reason. Does nothing if it is already gone."""
+        """End one connection. ``peer_left`` and the application get the reason. Does nothing if it is already gone."""
 
     @property
     def counters(self) -> dict[str, float]:
@@ -150,17 +150,17 @@ class TransportServer(ABC):
 
     @property
     def restricted(self) -> bool:
-        """Whether access to this proxy need not imply access to others, as with keys that name drones."""
+        """Whether an application may have access to this proxy but not to others, as with keys that name drones."""
         return False
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """Readable address of this end."""
+        """Readable address of this end of the connection."""
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks, called on its receiving thread, one at a time."""
+    """A transport client's callbacks. The callbacks run on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -168,54 +168,54 @@ class ClientHandler(Protocol):
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         """Handle a frame: ``header.size`` bytes, shape (size,), dtype uint8, not writeable.
 
-        The handler may keep the pixels, or any view of them, for as long as it likes; that affects only this
+        The handler may keep the pixels, or any view of them, for as long as it likes; this affects only its own
         application. ``topic``: the subscribed topic that the frame belongs to, if :attr:`TransportClient.variants` is
         true.
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, whichever end closed it and why. Called once, as the last callback."""
+        """Handle the end of the connection, whichever end closed it. Called once, as the last callback."""
 
 
 class TransportClient(ABC):
-    """An application's side: a single connection, made by a :data:`Dialer` and not reusable once closed."""
+    """An application's end: a single connection, made by a :data:`Dialer`. It can't be reused once it is closed."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send a packet to the proxy; return whether it was handed over. Any thread."""
+        """Send a packet to the proxy. Return whether the packet was handed over. Any thread."""
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Subscribe to a topic, or unsubscribe from it. Any thread.
+        """Subscribe to a topic, or end the subscription. Any thread.
 
         Raises :class:`UsageError` unless the name has 1 to :data:`MAX_TOPIC` characters.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection. Idempotent. ``closed`` runs before this returns, except on the receiving thread."""
+        """End the connection. Idempotent. ``closed`` is called before this returns, except on the receiving thread."""
 
     def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
         """Receive on the calling thread while it waits, so that a sample wakes only one thread rather than two.
 
         Meanwhile the handler runs on this thread, still one call at a time. Returns False if another thread is
-        receiving, so that the caller must wait as usual; ``wake`` is then called once, on another thread, when a retry
-        may succeed. By default, this is not supported. ``ready`` returns whether the wait is over; it is called on this
+        receiving. The caller must then wait as usual, and ``wake`` is called once, on another thread, when a retry may
+        succeed. By default, this is not supported. ``ready`` returns whether the wait is over. It is called on this
         thread after each packet and several times a second. The call may take 50 ms longer than ``timeout_s`` [s].
         """
         return False
 
     @property
     def receiving(self) -> bool:
-        """Whether the calling thread is inside :meth:`lead` and must not wait for its own packets."""
+        """Whether the calling thread is inside :meth:`lead`, and therefore must not wait for its own packets."""
         return False
 
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends are on one host and read the same monotonic clock, so that the offset is zero.
+        """Whether both ends are on one host and read the same monotonic clock. If so, the offset is zero.
 
-        An application also checks the clock named in the proxy's ``Welcome``: a host can have several time namespaces.
+        An application also checks the clock that ``Welcome`` names, because a host can have several time namespaces.
         """
 
     @property
@@ -237,16 +237,16 @@ class TransportClient(ABC):
         """Readable address that this end is connected to."""
 
 
-#: Connects and starts delivering to the handler. Raises :class:`skyloop.errors.LinkError` if that fails.
+#: Connects and starts delivering packets to the handler. Raises :class:`skyloop.errors.LinkError` if that fails.
 Dialer = Callable[[ClientHandler], TransportClient]
 
 
-#: Valid names for proxies, which can be used as a socket's file name and as one chunk of a network key.
+#: Valid names for proxies. Each name can be used as the file name of a socket and as one chunk of a network key.
 NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 
 
 def check_name(name: str) -> None:
-    """Raise :class:`UsageError` unless this can be the name of a proxy (:data:`NAME`)."""
+    """Raise :class:`UsageError` unless this is a valid name for a proxy (:data:`NAME`)."""
     if not NAME.fullmatch(name):
         raise UsageError(
             f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
@@ -267,12 +267,12 @@ def check_topic(topic: str) -> None:
 
 
 def too_many_topics(topic: str) -> str:
-    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics can't get more."""
+    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics can't get another."""
     return f"{topic[:64]!r} exceeds the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Raise :class:`UsageError` unless pixels match their header in size, dtype and order."""
+    """Raise :class:`UsageError` unless the pixels match their header in size, dtype and order."""
     if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(

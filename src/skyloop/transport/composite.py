@@ -1,4 +1,4 @@
-"""Combine several transport servers into one, for a proxy that serves its host and the network at once."""
+"""Combine several transport servers into one, for a proxy that serves its own host and the network at the same time."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ from skyloop.transport.priority import PriorityLock, is_command
 
 
 class CompositeServer(TransportServer):
-    """One transport server that combines several, nearest first, and numbers their peers itself.
+    """One transport server that combines several, nearest first. The server assigns its own numbers to their peers.
 
-    The handler gets one call at a time, as the contract requires: an end that has a command goes first, the others in
-    order of arrival.
+    The handler gets one call at a time, as the contract requires: commands first, all others in order of arrival.
     """
 
     def __init__(self, ends: Sequence[TransportServer]) -> None:
         if not ends:
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
-        self.lock = PriorityLock()  #: a thread must hold it to call the handler
+        self.lock = PriorityLock()  #: a thread must hold this lock to call the handler
         self._members: dict[
             int, tuple[TransportServer, Peer]
-        ] = {}  # by our number: the end with that application, and its peer there
+        ] = {}  # for each of our numbers, the end that the application is connected to, and its peer at that end
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Start accepting connections at all ends or, if an end's ``start`` raises, at none."""
+        """Start accepting connections at all ends. If one end's ``start`` raises, stop the ends that have started."""
         started: list[TransportServer] = []
         try:
             for end in self._ends:
@@ -41,9 +40,9 @@ class CompositeServer(TransportServer):
             raise
 
     def stop(self) -> None:
-        """Stop all ends at the same time, and wait for them unless called from a handler.
+        """Stop all ends at the same time, and wait for them unless this is called from a handler.
 
-        Waiting inside a handler would deadlock: its caller holds the lock that the stopping end waits for.
+        Waiting inside a handler would deadlock, because its caller holds the lock that the stopping end waits for.
         """
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
@@ -106,14 +105,14 @@ class CompositeServer(TransportServer):
 
 
 class _EndHandler:
-    """The handler at one end: forwards calls under the composite's lock, with the composite's peers."""
+    """The handler for one end. It calls the composite's handler with the composite's peers, under its lock."""
 
     def __init__(self, whole: CompositeServer, end: TransportServer, handler: ServerHandler) -> None:
         self._whole = whole
         self._lock = whole.lock
         self._end = end
         self._handler = handler
-        self._peers: dict[int, Peer] = {}  # our peers, by the end's number
+        self._peers: dict[int, Peer] = {}  # our peers, by the numbers that the end assigned
 
     def peer_joined(self, peer: Peer) -> None:
         with self._lock:

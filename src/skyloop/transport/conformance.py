@@ -1,4 +1,4 @@
-"""Conformance tests for transports: subclass :class:`TransportSuite` in your tests, and provide your two ends.
+"""Conformance tests for transports. Subclass :class:`TransportSuite` in your tests and provide your two ends.
 
 ::
 
@@ -39,15 +39,15 @@ from skyloop.transport.testing import (
 
 
 class TransportSuite(ABC):
-    """The contract in :mod:`skyloop.transport.base` as tests; pytest collects those that a subclass inherits."""
+    """The contract in :mod:`skyloop.transport.base` as tests. pytest collects the tests that a subclass inherits."""
 
     @abstractmethod
     def make_server(self) -> TransportServer:
-        """Return a new transport server, not yet started."""
+        """Return a new transport server that has not been started."""
 
     @abstractmethod
     def dialer(self, server: TransportServer) -> Dialer:
-        """Return a dialer to a server from :meth:`make_server`, whether started or not.
+        """Return a dialer to a server from :meth:`make_server`, whether or not the server is running.
 
         It raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` while the server does
         not run.
@@ -55,7 +55,7 @@ class TransportSuite(ABC):
 
     @contextmanager
     def serving(self) -> Iterator[tuple[TransportServer, ServerLog]]:
-        """Yield a started server and the log of its handler; stop the server at the end."""
+        """Yield a started server and its handler's log, and stop the server at the end."""
         server, log = self.make_server(), ServerLog()
         server.start(log)
         try:
@@ -65,7 +65,7 @@ class TransportSuite(ABC):
 
     @contextmanager
     def connected(self, server: TransportServer, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
-        """Yield a client that has joined and subscribed; close it at the end. ``keep``: its log keeps frames."""
+        """Yield a joined, subscribed client, and close it at the end. ``keep``: its log keeps frames."""
         client_log = ClientLog(keep=keep)
         known = len(log.joined)
         before = {topic: server.subscribers(topic) for topic in topics}
@@ -208,7 +208,7 @@ class TransportSuite(ABC):
                 server.publish_frame(header(seq), picture(header(seq)))
                 wait_until(partial(app.log.saw, seq), "the frame arrived, whatever views are kept")
                 head, pixels = app.log.frames.pop()
-                if seq % 4 == 0:  # the frame is kept alive only by a view of a view
+                if seq % 4 == 0:  # only a view of a view keeps the frame alive
                     views[head.seq] = pixels.reshape(head.height, head.width, 3)[::2, 1::2]
                 del pixels
             app.client.close()
@@ -260,7 +260,7 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: TransportServer) -> None:
-        """Dial; convert the error for an unknown name (``UsageError``), which is equally valid, to ``LinkError``."""
+        """Dial, and convert the other valid error for an unknown name (``UsageError``) to ``LinkError``."""
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

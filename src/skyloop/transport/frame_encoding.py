@@ -15,10 +15,10 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
-    """Encode a frame as requested; return the header that describes the result, and its bytes.
+    """Encode a frame as requested. Return the header that describes the result, and the result's bytes.
 
     A frame that is already a JPEG is returned unchanged, regardless of the request. Raises :class:`MissingExtraError`
-    if OpenCV is needed but not installed, and :class:`LinkError` if it could not encode the frame.
+    if OpenCV is needed but not installed, and :class:`LinkError` if OpenCV could not encode the frame.
     """
     channels = _CHANNELS.get(header.encoding)
     if channels is None or (request.encoding == "raw" and request.scale == 1.0):
@@ -44,11 +44,11 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
 
 
 def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
-    """Return the header of a frame resized to these pixels, as plain pixels, with matching intrinsics."""
+    """Return the header of a frame that is resized to these pixels, as plain pixels, with matching intrinsics."""
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
-        # The centre of the first pixel is (0, 0), so the fixed point of the scaling is its corner at (-0.5, -0.5).
+        # The first pixel's centre is at (0, 0). Scaling therefore leaves that pixel's corner at (-0.5, -0.5) in place.
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )
@@ -57,7 +57,7 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
 
 
 def resized(picture: Any, header: FrameHeader) -> Any:
-    """Resize an image of shape (height, width, channels) to the header's size by averaging areas, with OpenCV."""
+    """Resize an image of shape (height, width, channels) to the header's size. OpenCV averages areas."""
     size = (header.width, header.height)
     return _opencv().resize(picture, size, interpolation=_opencv().INTER_AREA).reshape(header.height, header.width, -1)
 

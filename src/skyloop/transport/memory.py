@@ -1,8 +1,8 @@
 """The transport within one process, for tests, and for a proxy and an application that share a process.
 
-It fulfils the whole contract of :mod:`skyloop.transport.base`, including receiving threads and bounded queues, so code
-that works with it works with other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
-and frames, identically for the same seed.
+It fulfils the whole contract of :mod:`skyloop.transport.base`, including receiving threads and bounded queues. Code
+that works with it therefore works with other transports. :class:`Faults` makes it lose, repeat, reorder and damage
+packets and frames, identically for the same seed.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from skyloop.transport.base import (
 
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
-DEPTH = 256  #: maximum number of packets waiting at an end; further ones are dropped
-FRAME_DEPTH = 4  #: maximum number of a camera's frames waiting at a client; the newest replaces the one before it
+DEPTH = 256  #: maximum number of packets waiting at one end; further packets are dropped
+FRAME_DEPTH = 4  #: maximum number of a camera's frames that wait at a client; the newest replaces the previous one
 
 _log = logging.getLogger(__name__)
 _Frame = tuple[FrameHeader, Pixels]
 
 
-#: A client, and a call to the handler that the server's receiving thread makes on its behalf.
+#: A client, and a call to the handler that the server's receiving thread makes on the client's behalf.
 _Item = tuple["MemoryClient", Callable[[ServerHandler], object]]
 
 
 class MemoryServer(TransportServer):
-    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
+    """A proxy's end. :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It can be restarted after a stop."""
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -61,7 +61,7 @@ class MemoryServer(TransportServer):
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect to this server, which must be running. The handler runs on the client's own receiving thread."""
+        """Connect to this server. The server must be running. The handler runs on the client's own receiving thread."""
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"{self.address} has no server: start the transport server first")
@@ -121,11 +121,11 @@ class MemoryServer(TransportServer):
         return f"memory:{self._name}"
 
     def arrived(self, client: MemoryClient) -> None:
-        """Wake the receiving thread for a packet in the client's ``outgoing``."""
+        """Wake the receiving thread for a packet in the client's ``outgoing`` queue."""
         self._inbox.put((client, client.pass_on))
 
     def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
-        """Return whether a client may subscribe to a topic; if not, call the handler's ``malformed``."""
+        """Return whether a client may subscribe to a topic. If not, report a malformed request to the handler."""
         problem = self._handler.topic_problem(topic) if self._handler is not None else ""
         if len(client.topics) >= MAX_SUBSCRIPTIONS:
             problem = problem or too_many_topics(topic)
@@ -134,7 +134,7 @@ class MemoryServer(TransportServer):
         return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection; ``muted``: drop the client's undelivered packets. Idempotent."""
+        """End a connection. ``muted``: drop the client's undelivered packets. Idempotent."""
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
                 return
@@ -156,7 +156,7 @@ class MemoryServer(TransportServer):
 
 
 class MemoryClient(TransportClient):
-    """An application's end, made by :meth:`MemoryServer.dial`."""
+    """An application's end of the transport, made by :meth:`MemoryServer.dial`."""
 
     def __init__(self, server: MemoryServer, peer: Peer, handler: ClientHandler, faults: Faults) -> None:
         self.peer = peer
@@ -170,11 +170,11 @@ class MemoryClient(TransportClient):
         self._down = FaultInjector(faults, f"{peer.id}/down")
         self._up_lock = threading.Lock()
         self._down_lock = threading.Lock()
-        # Items: a packet, the name of a camera with a frame to deliver, or None if the connection has ended.
+        # Items: a packet, the name of a camera that has a frame to deliver, or None once the connection has ended.
         self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
         self._frames: dict[str, deque[_Frame]] = {}
-        self._ended = False  # whether either end has ended the connection, so that nothing can be sent
-        self._closing = False  # whether this end has closed the connection, so that nothing more is delivered
+        self._ended = False  # whether either end has ended the connection, so that nothing more can be sent
+        self._closing = False  # whether this end has closed the connection and therefore delivers nothing more
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:
@@ -188,7 +188,7 @@ class MemoryClient(TransportClient):
             handler.packet(self.peer, packet)
 
     def report(self, handler: ServerHandler, problem: str) -> None:
-        """Tell the server's handler about a malformed request."""
+        """Report a malformed request to the server's handler."""
         if not self.muted:
             handler.malformed(self.peer, problem)
 
@@ -234,7 +234,7 @@ class MemoryClient(TransportClient):
         return True
 
     def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
-        """Queue a frame from the server; return False if it replaced a waiting frame, or the connection has ended."""
+        """Queue a frame from the server. Return False if it replaced another, or if the connection has ended."""
         room = True
         with self._down_lock:
             if self._ended:

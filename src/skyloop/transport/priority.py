@@ -1,13 +1,13 @@
-"""Commands first: the order in which packets, and the threads that bring them, reach the proxy.
+"""Commands first: the order in which packets, and the threads that carry them, reach the proxy.
 
-A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, handling
-outdated set-points costs time, only for them to be refused as stale, and the proxy gets even later. Therefore in a
-:class:`PacketBacklog`, a newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency
-stop) are kept; only repeats of the same one are merged.
+A command is the full desired state, and the library repeats it 32 times a second. When a proxy is late, it spends time
+on outdated set-points, only to refuse them as stale, and gets even later. Therefore in a :class:`PacketBacklog`, a
+newer set-point replaces an older one. One-off requests (take-off, landing, hover, emergency stop) are kept; only
+repeats of the same request are merged.
 
 Several threads share a :class:`PriorityLock` in order of arrival, commands first. A ``threading.RLock`` goes to any
-thread that is awake: one that re-acquires it in a loop can starve all others, and a command would wait behind two
-hundred requests from another application.
+thread that is awake. A thread that re-acquires the lock in a loop can starve all others, and a command would wait
+behind two hundred requests from another application.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ from skyloop.messages import Command, Idle, decode
 from skyloop.messages.codec import KINDS
 from skyloop.messages.command import SET_POINTS
 
-SUPERSEDED: Final = "commands.superseded"  #: counter of commands replaced by newer ones
+SUPERSEDED: Final = "commands.superseded"  #: number of commands that newer ones replaced
 MOST_PACKETS: Final = 256  #: maximum number of packets taken out of a socket before the first of them is handled
-MOST_BYTES: Final = 131_072  #: maximum total size of these packets
+MOST_BYTES: Final = 131_072  #: maximum total size of the packets taken out
 _NOTHING: Final[tuple[bytes, Command | None]] = (b"", None)
 _COMMAND: Final = bytes([KINDS[Command]])
 
 
 def is_command(packet: bytes) -> bool:
-    """Return whether a packet is a command or an emergency stop, which is handled before everything else."""
+    """Return whether a packet is a command or an emergency stop. Both are handled before all other packets."""
     return packet[5:6] == _COMMAND
 
 
 class Lane(IntEnum):
     """The class of the first packet in a backlog, most urgent first."""
 
-    URGENT = 0  #: commands of which at least one is not a set-point, such as a landing or an emergency stop
-    STEERING = 1  #: set-points, or keep-alives sent instead
+    URGENT = 0  #: commands that include at least one that is not a set-point, such as a landing or an emergency stop
+    STEERING = 1  #: set-points, or the keep-alives that are sent instead
     OTHERS = 2  #: anything else
 
 
@@ -52,19 +52,19 @@ class PacketBacklog:
         self._bytes = 0
         self._number = 0
         self._waiting: dict[int, tuple[bytes, Command | None]] = {}  # in order
-        self._set_point = self._idle = self._last = 0  # numbers of the newest ones, which may have been removed
+        self._set_point = self._idle = self._last = 0  # numbers of the newest slots, which may have been removed
 
     def __len__(self) -> int:
         return len(self._waiting)
 
     @property
     def full(self) -> bool:
-        """Whether the backlog can't take any more packets for now."""
+        """Whether the backlog currently can't take any more packets."""
         return len(self._waiting) >= self._most or self._bytes >= MOST_BYTES
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the leading commands or, if there are none, of the first packet; None if the backlog is empty."""
+        """The lane of the leading commands; without any, that of the first packet; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -111,14 +111,14 @@ class PacketBacklog:
     def _drop(self, number: int, newer: Command) -> int:
         """Drop an older command if it is still waiting; return how many were dropped."""
         _, older = self._waiting.get(number, _NOTHING)
-        if older is None or older.seq >= newer.seq:  # a network may have reordered them
+        if older is None or older.seq >= newer.seq:  # a network may have changed their order
             return 0
         self._take(number)
         return 1
 
 
 def _command(packet: bytes) -> Command | None:
-    """Return the command in a packet; None for anything else, including damaged commands."""
+    """Return the command in a packet; None if it contains anything else, including a damaged command."""
     if not is_command(packet):
         return None
     try:
@@ -129,23 +129,23 @@ def _command(packet: bytes) -> Command | None:
 
 
 class PriorityLock:
-    """A re-entrant lock that each holder hands to the next waiter.
+    """A re-entrant lock. Each holder hands the lock to the thread that waits next.
 
-    ``with lock:`` waits behind all others, ``lock.acquire(urgent=True)`` only behind other urgent waiters.
+    ``with lock`` waits behind all other threads; ``lock.acquire(urgent=True)`` waits only behind other urgent ones.
     """
 
     def __init__(self) -> None:
         self._taken = threading.Lock()  # locked while a thread owns this lock, and during a hand-over
-        self._owner = 0  # identity of the owning thread
-        self._depth = 0  # additional acquisitions by the owner
+        self._owner = 0  # identity of the thread that owns the lock
+        self._depth = 0  # additional acquisitions of the lock by its owner
         self._queues = threading.Lock()  # guards the queues
-        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiters, each with a lock to wake it
+        self._urgent: deque[tuple[threading.Lock, int]] = deque()  # waiting threads, each with a lock that wakes it
         self._others: deque[tuple[threading.Lock, int]] = deque()
 
     def acquire(self, urgent: bool = False) -> None:
-        """Wait for the lock, ahead of all non-urgent waiters if ``urgent``; the owner may acquire it again."""
+        """Wait for the lock, ahead of all non-urgent threads if ``urgent``. The owner may acquire the lock again."""
         me = threading.get_ident()
-        if self._taken.acquire(False):  # the usual case, in as few steps as possible
+        if self._taken.acquire(False):  # the most frequent case, handled in as few steps as possible
             self._owner = me
             return
         if self._owner == me:
@@ -155,11 +155,11 @@ class PriorityLock:
         woken.acquire()
         with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
-        self._hand_over()  # the lock may have been released since the first attempt
-        woken.acquire()  # the releaser has made this thread the owner
+        self._hand_over()  # the lock may have been released after the first attempt
+        woken.acquire()  # the releasing thread has made this thread the owner
 
     def release(self, *_: object) -> None:
-        """Release the lock once, as its owner (not checked); the last release hands it over."""
+        """Release the lock once. The caller must own it (this is not checked). The last release hands the lock over."""
         if self._depth:
             self._depth -= 1
             return
@@ -169,7 +169,7 @@ class PriorityLock:
             self._hand_over()
 
     def _hand_over(self) -> None:
-        """Give the lock to the first waiter, if it is free."""
+        """Give the lock to the first waiting thread, if the lock is free."""
         with self._queues:
             waiting = self._urgent or self._others
             if waiting and self._taken.acquire(False):
@@ -183,7 +183,7 @@ class PriorityLock:
 
     @property
     def waiting(self) -> int:
-        """Number of waiting threads."""
+        """Number of threads that wait."""
         return len(self._urgent) + len(self._others)
 
     __enter__ = acquire

@@ -1,6 +1,6 @@
 """Helpers for testing transports and their users: handlers that record their calls.
 
-Nothing here sleeps for a fixed time; :func:`wait_until` waits for a condition, but no longer than :data:`PATIENCE_S`.
+Nothing here sleeps for a fixed time. :func:`wait_until` waits for a condition, but no longer than :data:`PATIENCE_S`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def raises(error: type[Exception], call: Callable[[], object]) -> None:
-    """Check that a call raises an error; an error of another type passes through."""
+    """Check that a call raises an error. Errors of other types pass through."""
     try:
         call()
     except error:
@@ -41,8 +41,7 @@ def raises(error: type[Exception], call: Callable[[], object]) -> None:
 class ServerLog:
     """A server's handler that records its calls.
 
-    Its lists grow on the transport's receiving thread, where ``on_packet``, if set, is called with each packet after it
-    was recorded.
+    Its lists grow on the transport's receiving thread. If ``on_packet`` is set, it is called there with each packet.
     """
 
     def __init__(self) -> None:
@@ -50,7 +49,7 @@ class ServerLog:
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
         self.refusals: list[tuple[Peer, str]] = []
-        self.problems: dict[str, str] = {}  #: why these topics can't be subscribed to
+        self.problems: dict[str, str] = {}  #: the reasons why these topics can't be subscribed to
         self.complaints: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 
@@ -82,8 +81,8 @@ class ServerLog:
 class ClientLog:
     """A client's handler that records its calls.
 
-    With ``keep=False``, a frame's pixels are compared with :func:`picture` at once rather than kept, and ``torn`` lists
-    the numbers of frames that differ.
+    With ``keep=False``, each frame's pixels are compared with :func:`picture` immediately and not stored, and ``torn``
+    lists the numbers of frames that differ.
     """
 
     def __init__(self, *, keep: bool = True) -> None:
@@ -94,7 +93,7 @@ class ClientLog:
         self.torn: list[int] = []
         self.closings: list[str] = []
         self.on_packet: Callable[[bytes], None] | None = None
-        self.gate = threading.Event()  #: the handler blocks here while this is not set
+        self.gate = threading.Event()  #: the handler blocks here until this is set
         self.gate.set()
 
     def packet(self, packet: bytes) -> None:
@@ -125,7 +124,7 @@ def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> 
 
 
 def picture(head: FrameHeader) -> Pixels:
-    """Return the pixels of a frame for tests, as bytes; each byte depends on the frame's number."""
+    """Return the pixels of a frame for tests, as bytes. Each byte depends on the frame's number."""
     return (np.arange(head.size, dtype=np.uint32) * 7 + head.seq * 31).astype(np.uint8)
 
 
@@ -138,7 +137,7 @@ class Joined(NamedTuple):
 
 
 def resources() -> tuple[int, int]:
-    """Return the number of threads and, from ``/proc``, open descriptors of this process, after collecting garbage."""
+    """Return the number of this process's threads and (from ``/proc``) open descriptors, after garbage collection."""
     gc.collect()
     descriptors = Path("/proc/self/fd")
     return threading.active_count(), len(list(descriptors.iterdir())) if descriptors.exists() else 0

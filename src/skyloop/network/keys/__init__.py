@@ -1,7 +1,7 @@
-"""A lab's keys: who may join the network, and what each member may do there.
+"""A lab's keys. They determine who may join the network, and what each member may do there.
 
-A lab has one certificate authority, kept in a folder (:mod:`skyloop.network.keys.lab`), which issues identities. Each
-identity is a folder as well, for its machine; :func:`skyloop.network.keys.credentials.load` reads and checks it.
+A lab has one certificate authority, stored in a folder (:mod:`skyloop.network.keys.lab`). It issues identities. Each
+identity also has a folder, for its machine; :func:`skyloop.network.keys.credentials.load` reads and checks it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The keys of a running process: identities excluded by a newer roster, and the mutual proof of identity of two ends.
+"""The keys of a running process: which identities a newer roster excludes, and how two ends prove their identities.
 
 A link's certificates only identify the neighbour on that *link*, which may be a router. The two ends of a connection
 therefore also present their certificates to each other, in an exchange like those of SIGMA (Krawczyk, CRYPTO 2003) and
-TLS 1.3: each end signs a fresh X25519 share together with the terms of the connection; the proxy also signs the
-application's whole message. The secrets, unknown to any router, are derived from both shares and the transcript
-(HKDF-SHA256). Replayed messages are therefore useless, and a key that leaks later can't decrypt earlier recordings.
+TLS 1.3: each end signs a fresh X25519 share together with the terms of the connection. The proxy also signs the
+application's whole message. The secrets are derived from both shares and the transcript (HKDF-SHA256). No router knows
+them. Replayed messages are therefore useless, and a key that leaks later can't decrypt earlier recordings.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from skyloop.network.keys import certificates
 from skyloop.network.keys.credentials import Credentials, Roster
 from skyloop.network.keys.identity import Identity
 
-AGAIN: Final = timedelta(hours=1)  #: interval between warnings of an approaching expiry
+AGAIN: Final = timedelta(hours=1)  #: interval between warnings about an approaching expiry
 SECRET_BYTES: Final = 32
-_PURPOSE: Final = "fabric connection 1"  # prefix of all content signed here; no other signature uses it
+_PURPOSE: Final = "fabric connection 1"  # prefix of all content that is signed here; no other signature uses it
 _OFFER, _ANSWER = "offer", "answer"
 
 
@@ -38,10 +38,10 @@ class KeyRing:
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
-        #: Names that were revoked, or whose rights changed, since this process applied its roster.
+        #: Names that were revoked, or whose rights have changed, since this process applied its roster.
         self.shut_out: frozenset[str] = frozenset()
         self._in_force = credentials.roster
-        self._listed = frozenset(credentials.roster.identities)  # identities in the newest roster
+        self._listed = frozenset(credentials.roster.identities)  # identities that are in the newest roster
         self._stamp = _stamp(credentials)
         self._announced: dict[str, datetime] = {}
         self._pending: list[str] = []
@@ -54,23 +54,23 @@ class KeyRing:
 
     @property
     def outdated(self) -> bool:
-        """Whether the newest roster differs from the one applied by this process."""
+        """Whether the newest roster differs from the roster that this process applied."""
         return self._listed != frozenset(self._in_force.identities)
 
     def admits(self, identity: Identity) -> bool:
-        """Return whether the newest roster lists this identity with these rights, and it was never excluded."""
+        """Return whether the newest roster lists this identity with these rights and has never excluded it."""
         return identity in self._listed and identity.name not in self.shut_out
 
     def refresh(self) -> None:
-        """Read the roster if its file has changed; keep the resulting messages for :meth:`poll`."""
+        """Read the roster if its file has changed, and store the resulting messages for :meth:`poll`."""
         with self._lock:
             self._pending += self._read()
 
     def poll(self, now: datetime | None = None) -> list[str]:
         """Read the roster if its file has changed, and return messages for users, one sentence each.
 
-        These announce a newer roster and, once an hour, an expiry within a week. An unreadable roster is reported, and
-        the previous one stays in force.
+        These messages announce a newer roster and, once an hour, a certificate that expires within a week. A roster
+        that can't be read is reported, and the previous roster stays in force.
         """
         now = now or datetime.now(UTC)
         with self._lock:
@@ -106,7 +106,7 @@ class KeyRing:
 
 
 def _stamp(credentials: Credentials) -> tuple[int, int, int]:
-    """Return values that change whenever the roster's file does."""
+    """Return values that change whenever the roster's file changes."""
     try:
         found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and called every second
     except OSError:
@@ -115,11 +115,11 @@ def _stamp(credentials: Credentials) -> tuple[int, int, int]:
 
 
 class Proof(msgspec.Struct, frozen=True, array_like=True):
-    """The proof that one end sends to the other."""
+    """The proof that each end sends to the other."""
 
     certificate: bytes  #: DER
     share: bytes  #: X25519, 32 bytes
-    signature: bytes  #: ECDSA with SHA-256, made with the certificate's key, DER
+    signature: bytes  #: ECDSA with SHA-256, made with the certificate's key, in DER
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +128,12 @@ class Agreed:
 
     identity: Identity  #: the other end's identity
     expires: datetime  #: expiry of the other end's certificate
-    up: bytes  #: secret for the application's packets
-    down: bytes  #: secret for the proxy's packets
+    up: bytes  #: secret that seals the application's packets
+    down: bytes  #: secret that seals the proxy's packets
 
 
 class Agreement:
-    """One end's part in the exchange, using its keys; both ends have the same ``terms`` of the connection."""
+    """One end's part in the exchange, using its keys. Both ends have the same ``terms`` of the connection."""
 
     def __init__(self, ring: KeyRing, *terms: str) -> None:
         self._ring = ring
@@ -144,19 +144,19 @@ class Agreement:
         self._share = self._private.public_key().public_bytes_raw()
 
     def offer(self) -> bytes:
-        """Return the application's first message, a :class:`Proof` as MessagePack."""
+        """Return the application's first message, which is a :class:`Proof` as MessagePack."""
         self._offered = self._prove(self._claim(_OFFER, self._share))
         return self._offered
 
     def answer(self, offer: bytes, now: datetime | None = None) -> tuple[bytes, Agreed]:
-        """Check the application's offer; return the proxy's answer, a :class:`Proof`, and the agreed secrets."""
+        """Check the application's offer. Return the proxy's answer (a :class:`Proof`) and the agreed secrets."""
         proof = _decode(offer)
         identity, expires = self._check(proof, self._claim(_OFFER, proof.share), now)
         claim = self._claim(_ANSWER, self._share, offer)
         return self._prove(claim), self._agree(identity, expires, proof.share, claim)
 
     def accept(self, answer: bytes, now: datetime | None = None) -> Agreed:
-        """Check the proxy's answer and return the agreed secrets."""
+        """Check the proxy's answer and return the secrets that were agreed on."""
         proof = _decode(answer)
         claim = self._claim(_ANSWER, proof.share, self._offered)
         identity, expires = self._check(proof, claim, now)

@@ -1,8 +1,8 @@
 """Create, read and check X.509 certificates of a lab's authority and identities. Times are passed as arguments, in UTC.
 
-The certificate's common name is the identity's name, which Zenoh's access control uses. Its role and drones are in the
-URI ``urn:skyloop:ROLE:DRONES`` among the alternative names. Only certificates of proxies and routers may accept
-connections (extended key usage), so that nobody can impersonate a proxy with the key of a pilot or an observer.
+The certificate's common name is the identity's name, which Zenoh's access control uses. The identity's role and drones
+are in the URI ``urn:skyloop:ROLE:DRONES`` among the alternative names. Only certificates of proxies and routers may
+accept connections (extended key usage), so that nobody can impersonate a proxy with the key of a pilot or an observer.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ try:
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-except ImportError as error:  # always installed where tests run
+except ImportError as error:  # always installed where the tests run
     raise MissingExtraError("keys", "network", cause=str(error)) from None
 
 PrivateKey = ec.EllipticCurvePrivateKey
 Certificate = x509.Certificate
 
-#: Certificates are valid from a day before they are issued, for machines whose clocks are slow.
+#: Certificates are valid from the day before they are issued, for machines whose clocks are slow.
 BACKDATED: Final = timedelta(days=1)
 #: What a page authority may certify: private networks (RFC 1918, 4193, 3927, 6598), this machine …
 PAGE_NETWORKS: Final = (
     *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "169.254.0.0/16", "100.64.0.0/10", "127.0.0.0/8"),
     *("fc00::/7", "fe80::/10", "::1/128"),
 )
-#: … and names that do not exist on the Internet (RFC 6762, 8375; ICANN has reserved .internal).
+#: … and names that do not exist on the Internet (RFC 6762, 8375; ICANN has reserved ``.internal``).
 PAGE_NAMES: Final = ("localhost", "local", "lan", "internal", "home.arpa")
 _URN: Final = "urn:skyloop:"
 _CURVE: Final = ec.SECP256R1()
@@ -88,14 +88,14 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Create the authority of a new lab. Its name ends in random digits to distinguish labs."""
+    """Create the authority of a new lab. Its name ends in random digits to tell labs apart."""
     return _self_signed(f"Skyloop lab {secrets.token_hex(4)}", days, now)
 
 
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """Create a certificate for an identity, signed with the authority's key and valid no longer than the authority."""
+    """Create a certificate for an identity, signed with the authority's key and valid no longer than that."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
@@ -104,10 +104,10 @@ def issue(
 
 
 def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
-    """Create an authority for pages, separate from the lab's, that may certify only these names and names below them.
+    """Create an authority for pages, separate from the lab's. It may certify only these names and names below them.
 
-    Its certificates are valid for private addresses, names on local networks, and the given names. A browser that
-    trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
+    Its certificates are valid for private addresses, names on local networks, and the names given on creation. A
+    browser that trusts it does not trust it for any other site (name constraints, RFC 5280, 4.2.1.10).
     """
     permitted: list[x509.GeneralName] = [x509.IPAddress(ipaddress.ip_network(network)) for network in PAGE_NETWORKS]
     permitted += [x509.DNSName(each) for each in dict.fromkeys([*PAGE_NAMES, *names])]
@@ -148,7 +148,7 @@ def read_certificate(content: bytes, path: Path) -> x509.Certificate:
 
 
 def read_der(content: bytes) -> x509.Certificate:
-    """Decode a certificate in DER received over the network."""
+    """Decode a certificate in DER that was received over the network."""
     try:
         return x509.load_der_x509_certificate(content)
     except ValueError as error:
@@ -156,12 +156,12 @@ def read_der(content: bytes) -> x509.Certificate:
 
 
 def der(certificate: x509.Certificate) -> bytes:
-    """Encode a certificate in DER, for sending over the network."""
+    """Encode a certificate in DER, so that it can be sent over the network."""
     return certificate.public_bytes(serialization.Encoding.DER)
 
 
 def sign(key: PrivateKey, content: bytes) -> bytes:
-    """Sign content with an identity's key: ECDSA with SHA-256, in DER."""
+    """Sign content with an identity's key. The signature is ECDSA with SHA-256, in DER."""
     return key.sign(content, _SIGNED)
 
 
@@ -178,10 +178,10 @@ def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -
 
 
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Decode a private key on an elliptic curve, read from a file."""
+    """Decode an elliptic-curve private key that was read from a file."""
     try:
         key = serialization.load_pem_private_key(content, password=None)
-    except (ValueError, TypeError):  # TypeError is raised for an encrypted key
+    except (ValueError, TypeError):  # an encrypted key raises TypeError
         raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
         raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
@@ -189,7 +189,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Check that a certificate is an authority's. ``key`` is None on machines that issue nothing."""
+    """Check that a certificate belongs to an authority. ``key`` is None on machines that issue no certificates."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:
@@ -214,7 +214,7 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """Return the name that access control uses; empty if the certificate has none or several."""
+    """Return the name that access control uses; empty if the certificate contains no name or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
@@ -251,7 +251,7 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
 
 def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
     public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # verified by read_authority
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
     return public
 
 

@@ -1,4 +1,4 @@
-"""Load and check an identity's folder for a program, watch it for a newer roster; encode and decode rosters.
+"""Load and check an identity's folder for a program and watch it for a newer roster; encode and decode rosters.
 
 ================  ==============================================================================
 ``ca.pem``        the certificate of the lab's authority
@@ -7,8 +7,8 @@
 ``roster.json``   all identities in the lab, signed; to be replaced by newer ones
 ================  ==============================================================================
 
-Zenoh's access control identifies subjects by common name, so all names must be known wherever it is enforced. The
-roster file has two parts: the list itself, and a signature of exactly those bytes. Its number increases with each
+Zenoh's access control identifies subjects by common name, so every node that enforces it must know all names. The
+roster file has two parts: the list, and a signature of exactly the list's bytes. The number increases with each
 change, and the roster with the highest number applies.
 """
 
@@ -35,14 +35,14 @@ from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 
 FORMAT: Final = 1
-_PURPOSE: Final = b"skyloop roster\n"  # prefix of all content signed here; no other signature uses it
+_PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
 MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities takes 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
-NOTICE: Final = timedelta(days=7)  #: how long before an expiry it is announced
+NOTICE: Final = timedelta(days=7)  #: time before an expiry from which it is announced
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -89,7 +89,7 @@ class Roster(msgspec.Struct, frozen=True):
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
-        """Return the next roster, in which this entry replaces the one with the same name."""
+        """Return the next roster, in which this entry replaces the entry with the same name."""
         others = [other for other in self.entries if other.name != entry.name]
         entries = tuple(sorted([*others, entry], key=lambda each: each.name))
         return Roster(self.number + 1, self.lab, entries)
@@ -163,19 +163,19 @@ class Credentials:
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """Return, for this key and the lab's authority, a warning if it has expired or will within a week."""
+        """Return warnings for this key and the lab's authority if they have expired or will within a week."""
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """Return these credentials with a newer roster if the folder has one, otherwise None."""
+        """Return these credentials with the newer roster if the folder has one, otherwise None."""
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and verify all of it. Raises :class:`UsageError`, which says how to fix it."""
+    """Read an identity's folder and verify all its files. Raises :class:`UsageError`, which says how to fix it."""
     now = now or datetime.now(UTC)
     path = expand(directory).resolve()
     _check_folder(path)
@@ -195,7 +195,7 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """Read the public certificate and the roster from the folder of a lab or an identity."""
+    """Read the public certificate and the roster from a folder of a lab or an identity."""
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
     authority = _read_authority(directory)
@@ -203,7 +203,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_warning(what: str, end: datetime, now: datetime) -> str:
-    """Return a sentence for users if the expiry has passed or is less than a week away; otherwise an empty string."""
+    """Return a sentence for users if the key has expired or expires within a week; otherwise an empty string."""
     left = end - now
     if left > NOTICE:
         return ""
@@ -265,7 +265,7 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file atomically. A private file is readable only by its owner, from the first byte on."""
+    """Replace a file atomically. A private file is readable only by its owner, from the moment of its creation."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
@@ -285,7 +285,7 @@ def read(path: Path, what: str) -> bytes:
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """Read a file that must not be accessible to others, because they might have copied the key."""
+    """Read a file that must not be accessible to others, because they might have copied the key in it."""
     content = read(path, what)
     mode = path.stat().st_mode
     if mode & _OTHERS:
@@ -298,7 +298,7 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Lock a directory against changes by other processes; wait for the lock, which ends with its process."""
+    """Lock a directory against changes by other processes. Waits for the lock, which ends with its process."""
     try:
         import fcntl
     except ImportError:

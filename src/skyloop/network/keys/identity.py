@@ -1,13 +1,13 @@
 """Identities on the network (a name, a role, and the drones that the role applies to), and Zenoh's access control.
 
 A node applies the rules to the neighbour on each of its links, identified by the common name in the neighbour's
-certificate. What that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward
-(egress), and everything else is blocked. Each end thus protects itself, regardless of how others are configured. A
-router may publish and subscribe to everything, and applies the rules to its own neighbours; traffic through it is
-sealed, so that it cannot forge anything (:mod:`skyloop.network.sealing`).
+certificate. What that identity may *publish* is let in (ingress), what it may *subscribe* to is let out (egress), and
+everything else is blocked. Each end therefore protects itself, however the others are configured. A router may publish
+and subscribe to everything, and applies the rules to its own neighbours. Traffic through it is sealed, so it can't
+forge anything (:mod:`skyloop.network.sealing`).
 
 The two directions mirror each other: proxies subscribe to what applications publish, and vice versa. Declarations and
-queries count as messages in the direction in which they travel, so a subscriber's declaration counts as published.
+queries count as messages in the direction that they travel, so a subscriber's declaration counts as published.
 """
 
 from __future__ import annotations
@@ -42,17 +42,17 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 class KeyRole(StrEnum):
-    """What a key permits with respect to its identity's drones."""
+    """What a key permits its owner to do with the identity's drones."""
 
-    PILOT = "pilot"  #: may see every drone, and fly its own
-    OBSERVER = "observer"  #: may see its drones, but not fly any
+    PILOT = "pilot"  #: may observe every drone, and fly its own
+    OBSERVER = "observer"  #: may observe its drones, but not fly any
     PROXY = "proxy"  #: may serve drones with its names
     ROUTER = "router"  #: forwards everyone's sealed traffic between networks; it could drop traffic, but not read it
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A name and its rights. ``drones`` are patterns in which ``*`` matches any characters."""
+    """A name and its rights. ``drones`` contains patterns in which ``*`` matches any characters."""
 
     name: str
     role: KeyRole
@@ -63,7 +63,7 @@ class Identity:
         return any(fnmatchcase(drone, pattern) for pattern in self.drones)
 
     def may_fly(self, drone: str) -> bool:
-        """Return whether this is a pilot for a drone with this name."""
+        """Return whether this identity is a pilot for a drone with this name."""
         return self.role is KeyRole.PILOT and self.covers(drone)
 
     def may_see(self, drone: str) -> bool:
@@ -96,8 +96,8 @@ class Identity:
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
     """Create an identity from user input.
 
-    The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and is not ``anyone``; ``role`` is a value
-    of :class:`KeyRole`; ``drones`` are names or patterns separated by commas; for a router, ``*``.
+    The name has 1 to 48 lowercase letters, digits, ``_``, ``-`` and ``.``, and must not be ``anyone``. ``role`` is a
+    value of :class:`KeyRole`. ``drones`` are names or patterns, separated by commas; for a router, ``*``.
     """
     if not _NAME.fullmatch(name):
         raise UsageError(
@@ -134,7 +134,7 @@ def parse_drones(text: str) -> tuple[str, ...]:
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Return Zenoh's ``access_control`` section for any node in a lab: only these identities may join."""
+    """Return Zenoh's ``access_control`` section for any node in a lab. Only these identities may join."""
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -180,7 +180,7 @@ def may_publish(identity: Identity) -> Rules:
 
 
 def may_subscribe(identity: Identity) -> Rules:
-    """Return what an identity may receive: applications what proxies send to them, and vice versa."""
+    """Return what an identity may receive: what proxies send to applications for an application, and vice versa."""
     if identity.role is KeyRole.ROUTER:
         return may_publish(identity)
     names, alive, info = _chunks(identity.drones), layout.alive(_ANY, _ANY), layout.info(_ANY)
@@ -205,12 +205,12 @@ def may_subscribe(identity: Identity) -> Rules:
 
 
 def _to_applications(names: list[str]) -> list[str]:
-    """Return the keys on which proxies send packets and frames, and which applications subscribe to."""
+    """Return the keys that proxies send packets and frames on, and that applications subscribe to."""
     return [key for name in names for key in layout.downward(name)]
 
 
 def _to_proxies(identity: Identity, who: str) -> list[str]:
-    """Return the keys on which an application may send packets, or may receive ``who``'s subscription to them."""
+    """Return the keys on which an application may send packets or may receive ``who``'s subscription to them."""
     keys = [layout.upward(layout.ASK, name, who, _ANY) for name in _seen(identity)]
     if identity.role is KeyRole.PILOT:
         ways = (layout.ORDER, layout.COMMAND)
@@ -219,10 +219,10 @@ def _to_proxies(identity: Identity, who: str) -> list[str]:
 
 
 def _seen(identity: Identity) -> list[str]:
-    """Return the drones that an application may see. A pilot may see all drones, not only those it may fly."""
+    """Return the drones that an application may see. A pilot may observe all drones, not only those it may fly."""
     return _chunks(ALL_DRONES if identity.role is KeyRole.PILOT else identity.drones)
 
 
 def _chunks(patterns: tuple[str, ...]) -> list[str]:
-    """Convert each pattern to one chunk of a key expression, in which ``*`` is any name and ``$*`` any characters."""
+    """Convert each pattern to one chunk of a key expression: ``*`` becomes any name, ``$*`` any characters."""
     return [pattern if pattern == _ANY else pattern.replace("*", "$*") for pattern in patterns]

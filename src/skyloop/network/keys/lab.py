@@ -1,4 +1,4 @@
-"""Manage a lab's authority, a folder that issues and revokes identities, and certificates for cockpit pages.
+"""Manage a lab's authority (a folder that issues and revokes identities) and the certificates for cockpit pages.
 
 ================  ========================================================================
 ``ca.key``        the authority's private key: its holder can create any identity
@@ -8,8 +8,8 @@
 ================  ========================================================================
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
-separate authority, in a folder next to the lab's keys. Users have their browsers trust it, which is safe because it
-can't certify anything beyond private networks. Its key and the lab's key are not interchangeable.
+separate authority, in a folder next to the lab's key folder. Users make their browsers trust it. This is safe because
+the authority can't certify anything beyond private networks. The two keys can't replace each other.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust
@@ -52,20 +52,20 @@ from skyloop.network.keys.credentials import (
 from skyloop.network.keys.identity import Identity
 
 AUTHORITY_DAYS: Final = 1825  #: default validity of a lab's authority
-IDENTITY_DAYS: Final = 30.0  #: default validity of an identity
+IDENTITY_DAYS: Final = 30.0  #: default validity period of an identity
 MAX_IDENTITY_DAYS: Final = 366.0
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
 FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
 
-PAGE_DAYS: Final = 366  #: browsers refuse certificates that are valid for much longer
-RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that has fewer days left
+PAGE_DAYS: Final = 366  #: browsers reject certificates that are valid for much longer
+RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that is valid for fewer days than this
 
 
 class Lab:
-    """An authority that can issue identities, created by :meth:`make` or opened by :meth:`open`.
+    """An authority that can issue identities. Created by :meth:`make` or opened by :meth:`open`.
 
-    Each change is made under a lock on the folder, so that no change by another process is lost.
+    Each change holds a lock on the folder, so that a change by another process at the same time is not lost.
     """
 
     def __init__(self, directory: Path, authority: Authority) -> None:
@@ -102,7 +102,7 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster in the folder; :class:`UsageError` if it can't be read or was modified."""
+        """The roster in the folder. Raises :class:`UsageError` if it can't be read or was modified."""
         path = self.directory / ROSTER_FILE
         return decode_roster(read(path, "the roster"), self.authority, path)
 
@@ -111,7 +111,7 @@ class Lab:
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """Create or renew an identity's key and certificate; a revoked name is free once its lost key has expired."""
+        """Create or renew an identity's key and certificate. A revoked name is free once its lost key has expired."""
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
             raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
@@ -137,7 +137,7 @@ class Lab:
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Revoke an identity, wherever the new roster is installed, and delete the files in its folder here."""
+        """Revoke an identity wherever the new roster is installed, and delete its folder's files here."""
         with locked(self.directory):
             roster = self.roster
             entry = roster.find(name)
@@ -152,7 +152,7 @@ class Lab:
         return revoked
 
     def _write_roster(self, roster: Roster) -> None:
-        """Write the roster to the folders of the lab and all identities, so that every copy has the newest one."""
+        """Write the roster to the folders of the lab and of all identities, so that every copy is the newest one."""
         content = encode_roster(roster, self.authority)
         write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:
@@ -178,9 +178,9 @@ class PageFiles:
 def page_certificate(
     directory: Path, own: Sequence[str], wanted: Sequence[str] = (), now: datetime | None = None
 ) -> PageFiles:
-    """Return a certificate for a cockpit's page: the existing one if it is suitable, otherwise a new one.
+    """Return a certificate for a cockpit's page: the existing certificate if it is suitable, otherwise a new one.
 
-    ``own``: this machine's addresses and names; those that the authority may not certify are left out. ``wanted``:
+    ``own``: this machine's addresses and names. Those that the authority may not certify are left out. ``wanted``:
     names given by the user, which the authority must be able to certify.
     """
     now = datetime.now(UTC) if now is None else now

@@ -1,11 +1,11 @@
-"""Decide where a vehicle may fly, and how fast: a verdict on each set-point, position, hover, take-off, step. Pure.
+"""Decide where a vehicle may fly, and how fast: judge each set-point, position, hover, take-off and step. Pure.
 
 Every wall is a plane: those of the safety box and, for each no-fly zone, the plane through its nearest point that is
 perpendicular to the line of sight. The whole zone is behind that plane, because zones are convex. Inside a zone, the
-plane through which the vehicle entered is kept, so that the vehicle is led back to the side it came from. At distance
-``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the reaction time
-``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its component along the plane. An
-attitude passes unchanged until the vehicle reaches that speed, and is then replaced by one that brakes.
+plane through which the vehicle entered is remembered, so that the vehicle is led back to the side that it came from. At
+distance ``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the
+reaction time ``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its part parallel to the
+plane. An attitude passes unchanged until the vehicle reaches that speed. Then a braking attitude replaces it.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from skyloop.proxy.core.flight import STALE_NS
 from skyloop.zones import Space, Vec3, Wall, Zone
 
 GRAVITY_M_S2: Final = 9.80665
-LOST_NS: Final = 2 * NS_PER_S  #: age of a position beyond which it is not worth waiting for the next
-BLIND_M: Final = 0.5  #: maximum distance flown between walls towards a target without a new measured position
-#: A position has jumped if it changes by more than this, and by more than the vehicle could have flown.
+LOST_NS: Final = 2 * NS_PER_S  #: if a position is older than this, the next one is not worth waiting for
+BLIND_M: Final = 0.5  #: maximum distance flown towards a target between walls without a new measured position
+#: A position counts as having jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
-MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; any further out, only moving back is allowed
-BRAKE_GAIN: Final = 2.0  #: requested deceleration per unit of excess speed [1/s]
-RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further beyond a wall
-#: A vehicle hovering this far above ``limits.altitude`` [m] is lowered, at least at this speed [m/s].
+MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further out, the vehicle may only move back
+BRAKE_GAIN: Final = 2.0  #: requested deceleration for each unit of excess speed [1/s]
+RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further past a wall
+#: A vehicle that hovers this far above ``limits.altitude`` [m] is lowered, at this speed [m/s] or faster.
 HOVER_SLACK_M: Final = 0.3
 SINK_M_S: Final = 0.2
-TAKEOFF_M: Final = 1.0  #: assumed minimum height of a take-off
-LIFTED_M: Final = 0.3  #: a lower zone does not prevent a take-off: it may be the table that the vehicle is on
+TAKEOFF_M: Final = 1.0  #: minimum height assumed for a take-off
+LIFTED_M: Final = 0.3  #: a zone lower than this does not prevent a take-off: it may be the table that the vehicle is on
 
 _FAST_M_S: Final = 10.0  # assumed maximum speed of a vehicle that does not report its velocity
-_BLIND_S: Final = 0.1  # age of a position that the reaction time allows for
-_OLD_S: Final = 1.0  # maximum age taken into account for a position, because the vehicle may be at rest
-_AT_REST_M_S: Final = 0.05  # below this speed, vehicles may repeat the same position
+_BLIND_S: Final = 0.1  # age of a position that the reaction time already allows for
+_OLD_S: Final = 1.0  # maximum age of a position that is taken into account, because the vehicle may be at rest
+_AT_REST_M_S: Final = 0.05  # below this speed, vehicles may report the same position repeatedly
 _GROUND_NS: Final = NS_PER_S // 2  # the ground is the median over this time, so that a single wrong value has no effect
-_NO_WAY_M: Final = 0.05  # closer to the target, there is no meaningful direction to apply limits to
-_PASSES: Final = 8  # maximum number of times that a velocity is reduced by all walls in turn before a stop is demanded
+_NO_WAY_M: Final = 0.05  # this close to the target, there is no meaningful direction to apply limits to
+_PASSES: Final = 8  # maximum number of passes in which all walls in turn reduce a velocity before a stop is required
 
-#: Permitted climb rate per metre below ``limits.altitude`` [1/s], so that the vehicle slows down as it approaches that
-#: altitude. Above the limit, it sinks at the same rate per metre.
+#: Permitted climb rate for each metre below ``limits.altitude`` [1/s]. This limit slows the vehicle down as it
+#: approaches that altitude. Above the limit, the vehicle sinks at the same rate per metre.
 ALTITUDE_GAIN: Final = 1.0
 #: Altitudes that exceed ``limits.altitude`` by no more than this count as altimeter noise [m].
 SLACK_M: Final = 0.15
@@ -52,28 +52,28 @@ SLACK_M: Final = 0.15
 
 @dataclass(frozen=True, slots=True)
 class Clamp:
-    """A limit that reduced a set-point. For tilt and speed, the two numbers are the vector's lengths."""
+    """A limit that reduced a set-point. For tilt and speed, the two numbers are the lengths of the vectors."""
 
     limit: str  #: name of the parameter
     asked: float
     applied: float
-    zone: str = ""  #: name of the no-fly zone, if any
+    zone: str = ""  #: name of the no-fly zone, if there is one
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The effective limits."""
+    """The limits in force."""
 
-    tilt: float = 0.35  #: maximum tilt from the vertical, by roll and pitch combined [rad]
+    tilt: float = 0.35  #: maximum tilt from the vertical, with roll and pitch combined [rad]
     climb: float = 1.0  #: maximum speed up or down [m/s]
     yaw_rate: float = 1.75  #: maximum yaw rate [rad/s]
     speed: float = 2.0  #: maximum horizontal speed [m/s]
     altitude: float = 5.0  #: maximum height above ground [m]
 
     def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
-        """Return the nearest set-point within the limits, and the limits that applied.
+        """Return the nearest set-point within the limits, and the limits that were applied.
 
-        Tilt and horizontal speed are reduced without changing their direction. ``altitude`` is given [m] if known.
+        Tilt and horizontal speed are reduced without a change of direction. ``altitude`` is given [m] if it is known.
         """
         if type(action) is Velocity:
             x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
@@ -81,7 +81,7 @@ class Limits:
             assert isinstance(action, Attitude)
             x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
         highest = self.climb
-        if altitude is not None:  # above the limit, room is negative and the vehicle descends
+        if altitude is not None:  # above the limit, ``room`` is negative and the vehicle descends
             room = self.altitude - altitude
             highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
         if (
@@ -112,29 +112,29 @@ class AirspaceSettings:
     limits: Limits = field(default_factory=Limits)
     space: Space = field(default_factory=Space)
     deceleration: float = 1.0  #: deceleration that the vehicle can reliably achieve [m/s²]
-    reaction_s: float = 0.3  #: delay before the vehicle begins to brake
+    reaction_s: float = 0.3  #: delay before the vehicle starts to brake
 
 
 class Verdict(NamedTuple):
     """The decision on a request."""
 
-    action: AnyAction | None = None  #: the permitted action; None: the vehicle must stop, or stay on the ground
-    clamps: tuple[Clamp, ...] = ()  #: the limits that applied
-    refusal: Refusal | None = None  #: None also (like ``action``) if the request only waits for the next fresh position
+    action: AnyAction | None = None  #: the permitted action; None if the vehicle must stop, or stay on the ground
+    clamps: tuple[Clamp, ...] = ()  #: the limits that were applied
+    refusal: Refusal | None = None  #: also None (like ``action``) while the request only waits for a fresh position
     why: str = ""  #: readable reason for the refusal
-    enforced: bool | None = None  #: whether the safety box and zones could be enforced; None if there are none
+    enforced: bool | None = None  #: whether safety box and zones could be enforced; None if there are none
 
 
 class Airspace:
-    """Judges the actions requested of one vehicle, given its position."""
+    """Judges the actions that are requested of one vehicle, based on the vehicle's position."""
 
     def __init__(self, settings: AirspaceSettings | None = None) -> None:
         self.settings = settings or AirspaceSettings()
-        self.jumped_m = 0.0  #: size of a recent jump of the position; reset by the code that handles it
+        self.jumped_m = 0.0  #: size of a recent jump of the position; whoever handles it resets this
         self._way: tuple[Vec3, Space] | None = None  # the permitted target, and the space when it was permitted
         self._sinks = self._blocked = False  # whether the vehicle is sinking to the ceiling, and whether it is blocked
         self._newest: Feedback | None = None
-        self._at_ns = 0  # capture time of the newest position, not counting repeats
+        self._at_ns = 0  # capture time of the newest position; repeated positions do not count
         self._moves = False  # whether the vehicle's last permitted set-point makes it move
         self._sides: dict[Zone, tuple[Vec3, float]] = {}  # by zone: the plane nearest the vehicle when last outside
         self._ground: deque[tuple[int, float]] = deque()  # times, and heights of the ground in world axes [m]
@@ -142,11 +142,11 @@ class Airspace:
     def judge(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int, *, new: bool = False, planned: bool = False
     ) -> Verdict:
-        """Judge a new or repeated request, with finite numbers. ``now_ns``: on the clock of ``feedback.captured_ns``.
+        """Judge a new or repeated request with finite numbers. ``now_ns`` is on the clock of ``feedback.captured_ns``.
 
         Unless the request is ``new``, a permitted target stays permitted: the steps avoid an obstacle that drift puts
         in the way, and a lower ceiling lowers the target. ``planned``: whether the target is part of a route that was
-        checked as a whole, and so may be lowered from the start.
+        checked as a whole. Such a target may be lowered from the start.
         """
         self.observe(feedback)
         if isinstance(action, Position):
@@ -178,7 +178,7 @@ class Airspace:
         return Verdict(allowed, clamps, enforced=enforced)
 
     def objection(self, action: Position, feedback: Feedback | None, now_ns: int) -> str:
-        """Return what is wrong with a target, regardless of the path, as readable text; empty if nothing is."""
+        """Return readable text about what is wrong with a target itself; empty if it is valid."""
         self.observe(feedback)
         if action.problem or feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return action.problem
@@ -196,7 +196,7 @@ class Airspace:
         return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
 
     def apart(self) -> Airspace:
-        """Return a copy with the same observations, for hypothetical requests."""
+        """Return a copy with the same observations, for checking hypothetical requests."""
         other = Airspace(self.settings)
         other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
         other._sides, other._ground = dict(self._sides), self._ground.copy()
@@ -205,7 +205,7 @@ class Airspace:
     def observe(self, feedback: Feedback | None) -> None:
         """Update what is known about the vehicle's position: its age, its side of each zone, and the ground below it.
 
-        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown.
+        ``jumped_m`` is set if the position has changed by more than the vehicle could have flown in that time.
         """
         before, at = self._newest, None if feedback is None else feedback.position_m
         if feedback is None or at is None or feedback is before:
@@ -241,16 +241,16 @@ class Airspace:
     def allowed_speed(self, distance: float, late_s: float) -> float:
         """Return the maximum speed towards a wall at this distance [m/s]; 0 beyond the wall."""
         deceleration = self.settings.deceleration
-        # The positive root of v·t + v²/(2·a) = d.
+        # The positive root of ``v·t + v²/(2·a) = d``.
         lost = deceleration * late_s
         return math.sqrt(lost * lost + 2 * deceleration * distance) - lost if distance > 0.0 else 0.0
 
     def between_walls(
         self, action: AnyAction, feedback: Feedback | None, now_ns: int
     ) -> tuple[AnyAction, tuple[Clamp, ...], bool]:
-        """Return the nearest set-point between the walls, the limits that applied, and whether the position is known.
+        """Return the nearest set-point that the walls allow, the limits applied, and whether the position is known.
 
-        If it is not, the set-point is unchanged.
+        If the position is unknown, the set-point is unchanged.
         """
         if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
@@ -262,7 +262,7 @@ class Airspace:
         walls = self._walls(feedback.position_m)
         turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
         now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
-        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # the vehicle has moved since
+        if now is not None and age_s > _BLIND_S and speed > _AT_REST_M_S:  # the vehicle has moved since then
             walls = [wall._replace(distance=wall.distance - age_s * max(0.0, _dot(now, wall.normal))) for wall in walls]
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True
@@ -275,7 +275,7 @@ class Airspace:
         walls = [] if space.box is None else list(space.box.walls_inside(at))
         for zone in space.barriers:
             wall = zone.wall_outside(at)
-            # Inside a zone, the nearest plane could be on the far side: keep the one from before the vehicle entered.
+            # Inside a zone, the nearest plane could be on the far side. Keep the plane from before the vehicle entered.
             if wall.distance <= 0.0 and (side := self._sides.get(zone)) is not None:
                 normal, offset = side
                 wall = wall._replace(normal=normal, distance=offset - _dot(normal, at))
@@ -288,7 +288,7 @@ class Airspace:
         asked = _to_world((action.forward, action.left, action.up), turn)
         wanted, clamps = asked, dict[str, Clamp]()
         beyond = [(_dot(asked, wall.normal), wall) for wall in walls if wall.distance < -MARGIN_M]
-        # Beyond walls, stop unless the velocity leads back through at least one and no further beyond any other.
+        # Beyond walls, stop unless the velocity leads back through at least one wall and no further beyond any other.
         if beyond and any(asked) and (max(beyond)[0] > 0.0 or min(beyond)[0] >= 0.0):
             wall = beyond[0][1]
             clamps[wall.name] = Clamp(wall.name, math.hypot(*asked), 0.0, wall.zone)
@@ -375,7 +375,7 @@ class Airspace:
             return _out_of_range(problem)
         self._way = action.place, space
         speed, limit = _fastest(at, place, limits)
-        # This is reported only once, because the direction changes near the target.
+        # The limit is reported only once, because the direction changes near the target.
         if not goes_on and action.speed is not None and action.speed > speed:
             clamps.append(Clamp(limit, action.speed, speed))
         if action.turn_rate is not None and action.turn_rate > limits.yaw_rate:
@@ -385,7 +385,7 @@ class Airspace:
         return Verdict(fitted, tuple(clamps), enforced=True if space.walled else None)
 
     def _hover(self, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Hover; if above ``limits.altitude``, first descend unless something is in the way."""
+        """Hover. If the vehicle is above ``limits.altitude``, first descend unless something is in the way."""
         limits = self.settings.limits
         altitude = None if feedback is None else feedback.altitude_m
         above = 0.0 if altitude is None else altitude - limits.altitude
@@ -401,7 +401,7 @@ class Airspace:
         return Verdict(Hover() if self._blocked else sink, clamps, enforced=enforced)
 
     def _takeoff(self, action: Takeoff, feedback: Feedback | None, now_ns: int) -> Verdict:
-        """Refuse to take off inside a no-fly zone, or into one."""
+        """Refuse a take-off that begins in a no-fly zone or leads into one."""
         if feedback is None or feedback.position_m is None or not self._young(feedback, now_ns):
             return Verdict(action)
         x, y, z = feedback.position_m
@@ -410,13 +410,13 @@ class Airspace:
         return _out_of_range(f"the take-off would enter it: {problem}") if problem else Verdict(action)
 
     def _ground_below(self, feedback: Feedback) -> float | None:
-        """Return the recent median height of the ground below the vehicle, in world axes [m]; None if unknown."""
+        """Return the recent median height of the ground below the vehicle, in world axes [m]; None if it is unknown."""
         if feedback.altitude_m is None or not self._ground:
             return None
         return sorted(height for _, height in self._ground)[len(self._ground) // 2]
 
     def ceiling(self, feedback: Feedback) -> float:
-        """Return the maximum height here, in world axes [m]; infinite if the ground is unknown."""
+        """Return the maximum height at this point, in world axes [m]; infinite if the ground is unknown."""
         ground = self._ground_below(feedback)
         return math.inf if ground is None else ground + self.settings.limits.altitude
 
@@ -429,11 +429,11 @@ class Airspace:
         )
 
     def _age_s(self, feedback: Feedback, now_ns: int) -> float:
-        """Return the age of the newest position [s], even if it is a repeat."""
+        """Return the age of the newest position [s], even if that position is a repeat."""
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Return whether the newest position is fresh enough to fly to a target; speed matters between walls."""
+        """Return whether the newest position is fresh enough to fly to a target; between walls, speed matters."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)
@@ -442,7 +442,7 @@ class Airspace:
 
 
 def _speed(feedback: Feedback) -> float:
-    """Return the reported speed [m/s]; 0 if there is none."""
+    """Return the reported speed [m/s]; 0 if none was reported."""
     return 0.0 if feedback.velocity_m_s is None else math.hypot(*feedback.velocity_m_s)
 
 
@@ -469,7 +469,7 @@ def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
 
 
 def _fastest(at: Vec3, place: Vec3, limits: Limits) -> tuple[float, str]:
-    """Return the maximum speed along the line within the horizontal and vertical limits, and the binding limit."""
+    """Return the maximum speed along the line within the horizontal and vertical limits, and the limit that applies."""
     across, up = math.dist(at[:2], place[:2]), abs(place[2] - at[2])
     away = math.hypot(across, up)
     if away < _NO_WAY_M:

@@ -1,9 +1,9 @@
-"""The authority to command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
+"""The authority to command: numbered leases, priorities, and a queue of pilots who wait. Pure: the time is an argument.
 
-Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease whose
-number is unique in this run. A strictly higher priority takes over at once, or after the holder has been asked. A
-pre-empted pilot waits in the queue, which is ordered by priority, then by time of arrival. A holder that requested the
-authority for a limited time loses it once that time is over and the queue isn't empty. See ``docs/proxy.md``.
+Priority 0 is the highest, 31 the lowest. At any time, at most one application *holds* the authority. The holder has a
+lease, whose number is unique in this run. A strictly higher priority takes over at once or after the holder has been
+asked. A pre-empted pilot waits in the queue, which is ordered by priority and then by arrival. A holder that requested
+the authority for a limited time loses it once that time is over and others are waiting. See ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ class QueueEntry:
     """An application that holds or awaits the authority. Entries sort in the order in which they get the authority."""
 
     priority: int  #: 0 is the highest
-    arrival: int  #: number of its first request since it was last neither holder nor in the queue
+    arrival: int  #: number of the application's first request since it was last neither holder nor waiting
     app_id: int
     term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
-    #: When the holder, which is being asked, will be pre-empted; None if it is not being asked.
+    #: When the holder's time to answer the application's request is over; None if the holder was not asked.
     asks_until_ns: int | None = field(default=None, compare=False)
 
     def asks(self, now_ns: int) -> bool:
@@ -42,7 +42,7 @@ class Granted:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, its holder ``silent`` or ``gone``, or ``expired`` while others were waiting."""
+    """The lease ended: ``released``, its holder was ``silent`` or ``gone``, or ``expired`` while others waited."""
 
     app_id: int
     lease: int
@@ -51,7 +51,7 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Preempted:
-    """The lease ended because of a request with strictly higher priority, or because the holder ``granted`` one.
+    """The lease ended because of a request with strictly higher priority, or because the holder ``granted`` a request.
 
     The former holder waits in the queue.
     """
@@ -70,24 +70,24 @@ class Queued:
     app_id: int
     priority: int
     position: int
-    wait_ns: int | None = None  #: estimated wait; None: unknown
+    wait_ns: int | None = None  #: estimated waiting time; None if it is unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """The holder is being asked to hand the authority over."""
+    """The holder is being asked to hand over the authority."""
 
     app_id: int  #: the holder
     lease: int
     by_id: int
     by_priority: int
-    until_ns: int  #: time at which ``by_id`` wins if its priority is strictly higher
+    until_ns: int  #: time from which ``by_id`` wins if its priority is strictly higher
     term_ns: int | None = None  #: requested duration
 
 
 @dataclass(frozen=True, slots=True)
 class Declined:
-    """The holder declined to hand the authority over to ``app_id``, which continues to wait."""
+    """The holder declined to hand the authority over to ``app_id``, and ``app_id`` continues to wait."""
 
     app_id: int
     holder_id: int
@@ -96,7 +96,7 @@ class Declined:
 
 @dataclass(frozen=True, slots=True)
 class Withdrawn:
-    """The request to the holder was withdrawn: the other application left the queue or now waits without asking."""
+    """The request to the holder was withdrawn: the other application left the queue or stopped asking."""
 
     app_id: int  #: the holder
     lease: int
@@ -115,17 +115,17 @@ Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Withdrawn | Ex
 
 
 class Authority:
-    """Keeps track of who holds the authority over one vehicle, and of the queue. Methods return changes in order."""
+    """Tracks who holds the authority over one vehicle, and who waits for it. Methods return changes in order."""
 
     def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
-        self.timeout_ns = nanoseconds(timeout_s)  #: silence after which a holder loses the lease
-        self.ask_ns = nanoseconds(ask_s)  #: how long a holder may be asked before the higher priority wins
+        self.timeout_ns = nanoseconds(timeout_s)  #: after this time without packets, a holder loses the lease
+        self.ask_ns = nanoseconds(ask_s)  #: time for a holder to answer before the higher priority wins
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 if there is none
-        self.last_command_ns = 0  #: time of the last valid command from this or an earlier holder
-        self._granted_ns = 0  # when the holder got the lease
+        self.last_command_ns = 0  #: time of the last valid command from the current or an earlier holder
+        self._granted_ns = 0  # time at which the holder got the lease
         self.until_ns: int | None = None  #: end of the holder's time
-        #: The last holder, if it lost the lease by falling silent; listed until someone requests the authority.
+        #: The last holder, if it lost the lease by falling silent. It is listed until someone requests the authority.
         self.silent: QueueEntry | None = None
         self._last_lease = 0
         self._arrivals = 0
@@ -135,12 +135,12 @@ class Authority:
 
     @property
     def owner(self) -> QueueEntry | None:
-        """The owner shown to clients: the holder, or a former one that fell silent and has no successor."""
+        """The owner that clients see: the holder, or a former holder that fell silent and has no successor."""
         return self.holder or self.silent
 
     @property
     def waiting(self) -> tuple[QueueEntry, ...]:
-        """The queue, the next one first."""
+        """The queue, with the next application first."""
         return tuple(self._waiting)
 
     @property
@@ -149,15 +149,15 @@ class Authority:
         return self._last_lease
 
     def position(self, app_id: int) -> int:
-        """Return the position in the queue, starting with 1; 0 if the application is not waiting."""
+        """Return the position in the queue, counted from 1; 0 if the application is not waiting."""
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
 
     def asking(self, app_id: int, now_ns: int) -> bool:
-        """Return whether the holder is being asked to hand the authority over to this application."""
+        """Return whether this application is currently asking the holder to hand over the authority."""
         return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
 
     def wait_ns(self, app_id: int, now_ns: int) -> int | None:
-        """Return how long an application must wait if all others keep to their times; None if one has no limit."""
+        """Return how long an application must wait if all others keep to their times; None if any has no limit."""
         if self.holder is None or not self._waiting:
             return None
         wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
@@ -171,16 +171,16 @@ class Authority:
             wait_ns = None if wait_ns is None or entry.term_ns is None else wait_ns + entry.term_ns
         return None
 
-    # Requests of applications ------------------------------------------------------------------------------------
+    # Requests from applications ----------------------------------------------------------------------------------
 
     def request(
         self, app_id: int, priority: int, queue: bool, now_ns: int, *, term_ns: int | None = None, ask: bool = False
     ) -> list[Effect]:
-        """Request the authority, or change the priority or the time of an earlier request.
+        """Request the authority, or change an earlier request's priority or time.
 
-        ``queue``: whether to wait in the queue. ``term_ns``: requested duration; None: until released. ``ask``: whether
-        to ask the holder first. Afterwards the application holds the authority, has a :meth:`position`, or has been
-        refused because a holder has at least the same priority.
+        ``queue``: whether to wait in the queue. ``term_ns``: requested duration; None means until it is released.
+        ``ask``: whether to ask the holder first. Afterwards the application holds the authority, has a :meth:`position`
+        in the queue, or was refused because a holder has at least the same priority.
         """
         effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
@@ -188,13 +188,13 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # the application must request the authority again, like all others
+            effects.append(self._relieve())  # like all others, the application must request the authority again
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
             self._known_positions.pop(app_id, None)
         effects += self._hand_over(now_ns)
-        if not queue and entry in self._waiting:  # others of higher priority were waiting
+        if not queue and entry in self._waiting:  # other applications of higher priority were waiting
             self._waiting.remove(entry)
         effects += self._moved(now_ns)
         holder = self.holder
@@ -208,10 +208,10 @@ class Authority:
         return effects
 
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
-        """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or ``by_id`` has not asked.
+        """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or if ``by_id`` has not asked.
 
-        If the answer grants it, the first in the queue gets the authority, and the holder waits with at most the same
-        priority. A refusal is reported; a strictly higher priority still wins once the holder's time to answer is over.
+        If the holder agrees, the first in the queue gets the authority. The former holder then waits with at most the
+        same priority. A refusal is reported. A strictly higher priority still wins after the holder's time to answer.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -232,9 +232,9 @@ class Authority:
         return self._drop(app_id, "gone", now_ns)
 
     def update(self, now_ns: int) -> list[Effect]:
-        """Apply changes due by time; call at a steady pace.
+        """Apply changes that are due at this time. Call at a steady pace.
 
-        The lease of a silent holder ends, and so does that of a holder whose time is over while others wait. A holder
+        The lease of a silent holder ends. The lease of a holder whose time is over ends while others wait. A holder
         that has been asked for long enough is pre-empted.
         """
         holder = self.holder
@@ -252,7 +252,7 @@ class Authority:
         return effects
 
     def slept(self, ns: int) -> None:
-        """Make everything older by this time, during which the computer slept and its clock stopped."""
+        """Make everything older by this time, because the computer slept and its clock stopped meanwhile."""
         self.last_command_ns -= ns
         self._granted_ns -= ns
         if self.until_ns is not None:
@@ -263,7 +263,7 @@ class Authority:
     def _dequeue(
         self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
     ) -> tuple[QueueEntry, bool]:
-        """Remove the application's entry from the queue; return it, and whether it had asked the holder."""
+        """Remove the application's queue entry. Return the new one, and whether the old one had asked the holder."""
         known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
         asked_before = known is not None and known.asks(now_ns)
         if known is not None:
@@ -286,7 +286,7 @@ class Authority:
         return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
 
     def _change_term(self, term_ns: int | None, now_ns: int) -> None:
-        """Set the holder's remaining time, which can't be extended while others wait. None leaves it unchanged."""
+        """Set the holder's remaining time. The time can't be extended while others wait. None leaves it unchanged."""
         if term_ns is None:
             return
         until_ns = now_ns + term_ns
@@ -295,9 +295,9 @@ class Authority:
         self.until_ns, self._expiry_reported = until_ns, False
 
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
-        """Give the authority to the first in the queue; the holder waits.
+        """Give the authority to the first application in the queue. The former holder then waits.
 
-        The holder keeps its remaining time, but gets at most the new holder's priority, or it would win again at once.
+        The old holder keeps its time, but gets at most the new one's priority. Otherwise it would win again at once.
         """
         holder, lease = self.holder, self.lease
         assert holder is not None
@@ -308,7 +308,7 @@ class Authority:
         return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
 
     def _relieve(self) -> Lost:
-        """End the lease of a holder whose time is over while others wait."""
+        """End the lease of a holder whose time is over, if others are waiting."""
         assert self.holder is not None
         lost = Lost(self.holder.app_id, self.lease, "expired")
         self._vacate()
@@ -330,11 +330,11 @@ class Authority:
         return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
-        """Hand the authority over if due, then report changed positions in the queue."""
+        """Hand the authority over if this is due. Then report each application's changed position in the queue."""
         return self._hand_over(now_ns) + self._moved(now_ns)
 
     def _hand_over(self, now_ns: int) -> list[Effect]:
-        """Give the authority to the first in the queue if due.
+        """Give the authority to the first application in the queue if this is due.
 
         This is due if there is no holder, the holder's time is over, or a strictly higher priority need not wait.
         """

@@ -1,13 +1,13 @@
-"""The software autopilot: take-off, hover, land, velocity and position for vehicles that lack them. Pure.
+"""The software autopilot: take-off, hover, land, velocity and position for vehicles that lack these actions. Pure.
 
-It also handles the return to where the vehicle took off, for all vehicles. This is a series of targets, each judged as
-for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above the start,
-and a landing or hover there. Both are stepped by the caller. ``docs/proxy.md`` describes the rules of the return.
+The autopilot also handles the return to the take-off position, for all vehicles. A return is a series of targets, each
+judged as for ``go_to`` (:mod:`skyloop.proxy.core.airspace`): straight up to a safe height, straight to a point above
+the start, and a landing or hover there. The caller steps both. ``docs/proxy.md`` describes the rules of the return.
 
 A vehicle that supports velocities gets velocities; one that supports only attitude with climb rate gets the output of
 a velocity loop (proportional and integral, the usual cascade for small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
-"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103: to accelerate
-forward, the nose goes down, which is positive pitch; to accelerate left, the left side goes down: negative roll.
+"Multirotor Aerial Vehicles", IEEE Robotics & Automation Magazine 19(3), 2012). Signs follow REP 103. To accelerate
+forward, the nose goes down (positive pitch). To accelerate left, the left side goes down (negative roll).
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from skyloop.proxy.core.airspace import Airspace, Clamp
 from skyloop.proxy.core.flight import STALE_NS, STANDING_NS, Flight
 from skyloop.zones import Space, Vec3
 
-PERIOD_S: Final = 0.02  #: period of the steps for which the autopilot is designed
+PERIOD_S: Final = 0.02  #: step period that the autopilot is designed for
 ALTITUDE_GAIN: Final = 1.0  #: climb rate per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: maximum speed for holding a position [m/s]
-GO_GAIN: Final = 0.9  #: speed per remaining metre on the way to a target [1/s]
-GO_SPEED: Final = 1.0  #: maximum speed on the way to a target if none is given [m/s]
+GO_GAIN: Final = 0.9  #: speed for each metre that remains to the target [1/s]
+GO_SPEED: Final = 1.0  #: maximum speed on the way to a target, if the target gives none [m/s]
 GO_DECELERATION: Final = 0.6  #: deceleration towards the target [m/s²]
-TURN_GAIN: Final = 1.5  #: yaw rate per remaining radian [1/s]
-TURN_RATE: Final = 1.2  #: maximum yaw rate if none is given [rad/s]
-SETTLED_SPEED: Final = 0.2  #: speed below which a hover fixes its position [m/s]
-ARRIVED: Final = 0.1  #: a take-off ends this far below its altitude [m]
+TURN_GAIN: Final = 1.5  #: yaw rate per radian that remains to turn [1/s]
+TURN_RATE: Final = 1.2  #: maximum yaw rate if the set-point gives none [rad/s]
+SETTLED_SPEED: Final = 0.2  #: speed below which a hover holds its position [m/s]
+ARRIVED: Final = 0.1  #: a take-off ends at this distance below its altitude [m]
 LONGEST_RISE: Final = 2.0  #: a take-off ends after this multiple of its nominal duration, ...
 LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 
 # Return flight:
-NEAR_M: Final = 0.3  #: a vehicle this close, and at rest, has arrived
-CLOSE_M: Final = 1.0  #: a vehicle this close has arrived if it gets no closer
+NEAR_M: Final = 0.3  #: a vehicle that is this close and at rest has arrived
+CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arrived
 AT_REST_M_S: Final = 0.3
-HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this ...
-STALL_NS: Final = 10 * NS_PER_S  #: ... within this time
-#: How long a failsafe tolerates something that prevents a return before it lands the vehicle in place.
+HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this …
+STALL_NS: Final = 10 * NS_PER_S  #: … within this time
+#: How long a failsafe waits for a problem that prevents a return to go away, before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
 CLEARANCE_M: Final = 0.3  #: distance to keep from the ceiling of the room and the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -66,7 +66,7 @@ SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position",
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:
-    """Return the actions that the autopilot adds to a vehicle's native ones."""
+    """Return the actions that the autopilot adds to a vehicle's native actions."""
     if not native & {"attitude", "velocity"}:
         return frozenset()
     return SOFTWARE - native
@@ -74,7 +74,7 @@ def software_actions(native: frozenset[str]) -> frozenset[str]:
 
 @dataclass(frozen=True, slots=True)
 class AutopilotSettings:
-    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], gains [rad per m/s] and [rad per m]."""
+    """The autopilot's tuning. Altitude [m], speeds [m/s], ``tilt`` [rad], and gains [rad per m/s] and [rad per m]."""
 
     takeoff_altitude: float = 1.0
     climb: float = 0.5
@@ -86,10 +86,10 @@ class AutopilotSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReturnSettings:
-    """Settings of a return."""
+    """The settings of a return."""
 
     height: float = 2.0  #: minimum height above the start on the way [m]
-    speed: float = 1.0  #: maximum speed on the way [m/s]
+    speed: float = 1.0  #: maximum speed on the way back [m/s]
     land: bool = True  #: whether to land at the end rather than hover
 
 
@@ -114,7 +114,7 @@ _STATES: Final = {
 
 
 class Autopilot:
-    """Flies one vehicle in software; ``flight`` is informed of the current task and decides when it has ended."""
+    """Flies one vehicle in software. ``flight`` is informed of the current task and decides when the task has ended."""
 
     def __init__(
         self, native: frozenset[str], settings: AutopilotSettings | None = None, flight: Flight | None = None
@@ -123,14 +123,14 @@ class Autopilot:
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
         self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
-        #: Returns the permitted velocity for a desired one, given the newest feedback; not called during a landing.
+        #: Returns the permitted velocity for a desired one, given the newest feedback. Not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
-        self._integral = (0.0, 0.0)  # integrals forward and left [rad]
+        self._integral = (0.0, 0.0)  # integrals in the forward and left directions [rad]
         self._stepped_ns: int | None = None
-        self._lifted_ns: int | None = None  # when the take-off left the ground
-        self._from_height: float | None = None  # height according to the position at that time [m]
+        self._lifted_ns: int | None = None  # time at which the take-off left the ground
+        self._from_height: float | None = None  # height at that time, according to the position [m]
         self._altitudes: set[float] = set()  # lowest and highest readings since then [m]
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
@@ -139,11 +139,11 @@ class Autopilot:
     def start(
         self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
     ) -> None:
-        """Start a task; :meth:`step` continues it. Repeats of the current task change nothing."""
+        """Start a task. :meth:`step` continues it. Repeating the current task changes nothing."""
         mode = _MODES[type(action)]
         if isinstance(action, Velocity | Position):
             if isinstance(self._target, Position) and self._target.yaw is not None:
-                self._hold_yaw = None  # from now on, keep the yaw reached so far, not the earlier one
+                self._hold_yaw = None  # from now on, hold the current yaw instead of the earlier one
             self._target = action
         if mode is self.mode:
             return
@@ -155,18 +155,18 @@ class Autopilot:
         self._hold_altitude = feedback.altitude_m if feedback is not None else None
 
     def stop(self, action_name: str) -> None:
-        """Stop steering, because the vehicle itself is executing an action now."""
+        """Stop steering, because the vehicle itself is now executing an action."""
         self.mode = Mode.OFF
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
-        """Stop moving, because the vehicle failed to execute the action that was to replace this task."""
+        """Stop moving, because the vehicle failed to execute the action that was supposed to replace this task."""
         if isinstance(self._target, Position) and self._target.yaw is not None:
-            self._hold_yaw = None  # keep the yaw reached so far, as in `start`
+            self._hold_yaw = None  # hold the current yaw, as in ``start``
         self._target = Velocity()
 
     def refused(self, reported: FlightState) -> None:
-        """Handle the vehicle's refusal of a set-point; a take-off is over if the vehicle ``reported`` being landed."""
+        """Handle the vehicle's refusal of a set-point. If it ``reported`` being landed, a take-off is over."""
         if self.flight.refused(reported):
             self.mode = Mode.OFF
 
@@ -175,7 +175,7 @@ class Autopilot:
     ) -> Attitude | Velocity | None:
         """Return the set-point to send now; None while the autopilot is off. Call every :data:`PERIOD_S`.
 
-        ``reported``: the flight state from the driver, which may differ from that in ``feedback``.
+        ``reported``: the flight state reported by the driver, which may differ from the state in ``feedback``.
         """
         if self.mode is Mode.OFF:
             return None
@@ -205,7 +205,7 @@ class Autopilot:
         return self._target
 
     def _rise(self, now_ns: int, known: Feedback | None, lifted: bool) -> Velocity:
-        """Climb until the altimeter (failing that, the position, or the time) indicates enough height."""
+        """Climb until the altimeter (if there is none, the position or the time) indicates enough height."""
         settings = self.settings
         altitude = known.altitude_m if known is not None else None
         height = known.position_m[2] if known is not None and known.position_m is not None else None
@@ -224,8 +224,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter always reads the same. If its readings change but show the vehicle on the ground when time
-        # is up, they are right: the motors turn without lifting off, as seen with a real Betaflight on a slow computer.
+        # A stuck altimeter always reports the same altitude. If its readings change but stay near the ground until time
+        # is up, they are right: the motors turn without lifting it, as with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
@@ -236,7 +236,7 @@ class Autopilot:
         return Velocity()
 
     def _hold(self, known: Feedback | None) -> Velocity:
-        if known is None:  # the vehicle may be anywhere when it is next received, and will hold that position
+        if known is None:  # the vehicle may be anywhere when it is next received, and will then hold that position
             self._hold_altitude = self._hold_position = None
             return Velocity()
         altitude, up = known.altitude_m, 0.0
@@ -257,7 +257,7 @@ class Autopilot:
         return Velocity(forward, left, up)
 
     def _go(self, target: Position, known: Feedback | None) -> Velocity:
-        """Fly straight to a target, more slowly near it; stop while the position or yaw is unknown."""
+        """Fly straight to a target, slower when close to it. Stop while the position or yaw is unknown."""
         if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
         if self._hold_yaw is None:
@@ -277,7 +277,7 @@ class Autopilot:
         )
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
-        """Return the roll and pitch [rad] for reaching a velocity; level while the velocity is unknown."""
+        """Return the roll and pitch [rad] for reaching a velocity; both are 0 while the velocity is unknown."""
         self.drifts = known is None or known.velocity_m_s is None
         if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
@@ -315,17 +315,17 @@ def _shorten(x: float, y: float, most: float) -> tuple[float, float]:
 
 
 class StartPoint:
-    """Keeps the position where the vehicle last left the ground, in world axes."""
+    """Stores the position where the vehicle last left the ground, in world axes."""
 
     def __init__(self) -> None:
-        self.position: Vec3 | None = None  #: the position [m]; None if unknown
+        self.position: Vec3 | None = None  #: the position [m]; None if it is unknown
         self._state = FlightState.UNKNOWN
-        self._standing_ns: int | None = None  # start of the current period on the ground; None in the air
-        self._flew = False  # whether it has been seen in the air
-        self._open = False  # whether the vehicle is taking off and its position is not known yet
+        self._standing_ns: int | None = None  # start of the current period of time on the ground; None in the air
+        self._flew = False  # whether the vehicle has been seen in the air
+        self._open = False  # whether the vehicle is taking off and its position is still unknown
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
-        """Observe the vehicle; if it briefly reports "landed" while in the air, the start does not change."""
+        """Observe the vehicle. If it briefly reports "landed" while in the air, the start does not change."""
         before, self._state = self._state, state
         if state in _GROUNDED:
             if self._standing_ns is None:
@@ -353,14 +353,14 @@ class ReturnDecision(NamedTuple):
 
     action: Position | Land | None = None  #: the vehicle's next action; None if it must stop
     clamps: tuple[Clamp, ...] = ()
-    refusal: Refusal | None = None  #: None also (like ``action``) if the return only waits for a fresh position
+    refusal: Refusal | None = None  #: also None (like ``action``) if the return is only waiting for a fresh position
     why: str = ""  #: readable reason for the refusal
     lasting: bool = False  #: whether it is pointless to wait for a fresh position
-    enforced: bool | None = None  #: whether safety box and zones were enforced; None if there are none, or no target
+    enforced: bool | None = None  #: whether box and zones were enforced; None if none are set or there is no target
 
 
 class ReturnFlight:
-    """One flight back to the start; ``settings`` provide what the action does not specify."""
+    """One return flight to the start. The settings fill in what the action does not specify."""
 
     def __init__(self, action: ReturnToStart, start: Vec3 | None, settings: ReturnSettings) -> None:
         self.phase = ReturnPhase.NONE
@@ -371,7 +371,7 @@ class ReturnFlight:
         self._land = settings.land if action.land is None else action.land
         self._target: Vec3 = (0.0, 0.0, 0.0)
         self._flown: Vec3 = (0.0, 0.0, 0.0)  # the target, lowered if the ceiling is lower
-        self._over: Vec3 = (0.0, 0.0, 0.0)  # the point above the start
+        self._over: Vec3 = (0.0, 0.0, 0.0)  # the point directly above the start
         self._left_m, self._left_ns = math.inf, 0  # the shortest remaining distance so far, and when it was reached
         self._stepped_ns = 0
 
@@ -395,7 +395,7 @@ class ReturnFlight:
         return ReturnDecision(None, place.clamps, place.refusal, place.why)
 
     def _plan(self, airspace: Airspace, feedback: Feedback | None, now_ns: int) -> ReturnDecision | None:
-        """Start, or continue with the next leg; return an objection, if any."""
+        """Start, or continue with the next leg; return the objection, if any."""
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
@@ -410,7 +410,7 @@ class ReturnFlight:
         return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, problem, True) if problem else None
 
     def _begin(self, start: Vec3, airspace: Airspace, feedback: Feedback, at: Vec3) -> str:
-        """Plan the whole return; return what is in the way, as readable text."""
+        """Plan the whole return. Return what is in the way, as readable text."""
         space = airspace.settings.space
         top = max(at[2], start[2] + self._height) if math.dist(at[:2], start[:2]) >= CLOSE_M else at[2]
         top = min(top, airspace.ceiling(feedback))
@@ -418,13 +418,13 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # Outside the box or inside a zone, don't climb first, because the straight line leads back.
+        # Outside the box or inside a zone, the vehicle must not climb first, because the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:
             problem = space.problem_between(at, above)
         if not problem and self._land:
-            below = Space(zones=space.zones)  # the box may end above the ground
+            below = Space(zones=space.zones)  # the bottom of the box may be above the ground
             problem = below.problem_between(over, start)
         if problem:
             return problem
@@ -434,7 +434,7 @@ class ReturnFlight:
         return ""
 
     def _go_on(self, feedback: Feedback, at: Vec3, now_ns: int) -> str:
-        """Start the next leg when the current one is over; return an objection, if any, as readable text."""
+        """Start the next leg when the current leg is over. Return an objection, if there is one, as readable text."""
         left_m = math.dist(at, self._flown)
         paused, self._stepped_ns = now_ns - self._stepped_ns > NS_PER_S, now_ns
         if paused or left_m < self._left_m - HEADWAY_M:
@@ -443,7 +443,7 @@ class ReturnFlight:
         if self.phase is ReturnPhase.CLIMBING:
             if at[2] >= self._target[2] - NEAR_M or (stalled and left_m <= CLOSE_M):
                 self.phase, self._left_m = ReturnPhase.FLYING, math.inf
-                self._target = self._flown = self._over  # it is judged together with the straight line to it
+                self._target = self._flown = self._over  # it is judged together with the straight line to the start
                 return ""
         elif self.phase is ReturnPhase.FLYING:
             slow = feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S

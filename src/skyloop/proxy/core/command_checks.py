@@ -1,9 +1,9 @@
-"""Track an application's intents from start to end, and check each command. Pure.
+"""Track each of an application's intents from start to end, and check each command. Pure.
 
-The library repeats each command many times a second. A repeat refers to its intent: it is judged again while the intent
-is in progress, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends one.
+The library repeats each command many times a second. A repeat refers to its intent. It is checked again during the
+intent, and has no effect afterwards. :data:`skyloop.messages.command.ENDINGS` lists everything that ends an intent.
 
-The checks come in this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide
+The checks come in this order: sequence, age, lease and finite numbers (:meth:`CommandChecks.receive`; these four decide
 whether a command is a sign of life of the holder); then whether its intent is in progress, the vehicle link, support,
 whose flight it is, the flight state, limits, safety box and zones (:meth:`CommandChecks.decide`). ``docs/proxy.md``
 describes the rules.
@@ -46,53 +46,53 @@ from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, ReturnSet
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
-MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far ahead a command's time may be, given errors in the clock offset
-TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground within this time is withdrawn
+MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: maximum lead of a command's time, given errors in the clock offset
+TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground after this time is withdrawn
 #: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
 _UP: Final = (FlightState.HOVERING, FlightState.FLYING)
 _SILENT: Final = (Fate.COMPLETED, Fate.WITHDRAWN)  #: fates of intents whose repeats are refused without explanation
 _LANDINGS: Final = (Land, ReturnToStart)
-_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: after these, the next repeat may succeed
+_PASSING: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: the next repeat after one of these may succeed
 
 _HOVER_ACTION: Final = Hover()
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
-_TAKING: Final = (Takeoff, Hover, Land)  #: actions that, as new requests, take over a vehicle flown by others
+_TAKING: Final = (Takeoff, Hover, Land)  #: actions that take over a vehicle flown by others if they are new requests
 
 
 @dataclass(slots=True)
 class Intent:
-    """One request of an application."""
+    """One request from an application."""
 
     number: int
     action: AnyAction
     asked_ns: int
-    state: FlightState  #: the vehicle's state when it was requested, or last observed
+    state: FlightState  #: the vehicle's state when the intent was requested or last observed
     fate: Fate = Fate.UNDER_WAY
     begun: bool = False  #: whether the vehicle has started to execute the intent
     automatic: bool = False  #: whether the library itself requested the intent
-    withdrew: bool = False  #: whether it ended a take-off that had not left the ground
+    withdrew: bool = False  #: whether the intent ended a take-off that had not left the ground
     reason: Refusal | None = None
     text: str = ""
 
     @property
     def over(self) -> bool:
-        """Whether this intent has ended; repeats of it then have no effect."""
+        """Whether this intent has ended. Repeats of an ended intent have no effect."""
         return self.fate is not Fate.UNDER_WAY
 
     def end(self, fate: Fate, text: str = "", reason: Refusal | None = None) -> None:
-        """End the intent unless it has already ended. ``text`` and ``reason`` are the answer to its repeats."""
+        """End the intent unless it has already ended. ``text`` and ``reason`` answer its repeats."""
         if self.fate is Fate.UNDER_WAY:
             silent = fate in _SILENT
             self.reason = None if silent else reason or Refusal.NOT_FRESH
             self.text = "" if silent else text or f"{ENDINGS[fate]}: send a new command"
-            self.fate = fate  # last, because other threads read it without a lock
+            self.fate = fate  # set last, because other threads read it without a lock
 
     def refuse(self, reason: Refusal, why: str) -> None:
         """End the intent with a refusal.
 
-        Hovers and landings stay in progress if only the driver failed or the link is lost, because nothing is safer.
-        Resets always do, because the emergency may not be known yet. All count as refused until a repeat is executed.
+        Hovers and landings stay in progress if only the driver failed or the link is lost, as nothing is safer. So do
+        all resets, because the emergency may not be known yet. All count as refused until a repeat is executed.
         """
         kind = type(self.action)
         self.reason, self.text = reason, why
@@ -129,11 +129,11 @@ class Intent:
             self.end(Fate.COMPLETED)
 
     def outcome(self, app_id: int, name: str, state: FlightState) -> Outcome:
-        """Return the intent's outcome for feedback, given the application's name and the vehicle's state there.
+        """Return the intent's outcome for the feedback, given the application's name and the vehicle's state in it.
 
         A take-off that has only just left the ground has no outcome yet: others may have taken over during the climb.
         """
-        fate = self.fate  # read first, because another thread may end the intent now
+        fate = self.fate  # read this first, because another thread may end the intent now
         if fate is Fate.UNDER_WAY and state in _UP and self.begun and type(self.action) is Takeoff:
             return Outcome()
         if not self.text:
@@ -146,7 +146,7 @@ NO_INTENT: Final = Intent(-1, Idle(), 0, FlightState.UNKNOWN, Fate.COMPLETED)
 
 
 class Intents:
-    """The requests of one connection: its sequence numbers, and its newest intent."""
+    """The requests of one connection: their sequence numbers, and the newest intent."""
 
     __slots__ = ("_ended", "_floor", "_received", "newest", "seq")
 
@@ -154,13 +154,13 @@ class Intents:
         self.seq = -1  #: sequence number of the newest command received
         self.newest = NO_INTENT
         self._received = 0  # highest intent received, including refused commands
-        self._floor = -1  # intents up to this one were ended by an event
-        self._ended = Fate.AUTHORITY  # fate of the intents that the event ended
+        self._floor = -1  # an event ended the intents up to this number
+        self._ended = Fate.AUTHORITY  # fate of the intents that this event ends
 
     def check(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
-        """Check sequence, age, lease and numbers, and remember the sequence.
+        """Check a command's sequence, age, lease and numbers, and remember its sequence.
 
-        ``lease``: the lease in force (0 if there is none); ``holds``: whether the sender holds it. Returns None if the
+        ``lease``: the lease in force (0 if there is none). ``holds``: whether the sender holds it. Returns None if the
         command counts as a sign of life.
         """
         if command.seq <= self.seq:
@@ -178,7 +178,7 @@ class Intents:
         return None
 
     def intent_of(self, command: Command, state: FlightState, now_ns: int) -> tuple[Intent, bool]:
-        """Return the intent of a command that passed :meth:`check`, and whether it is a new request."""
+        """Return the intent of a command that passed :meth:`check`, and whether the command is a new request."""
         newest, number = self.newest, command.intent
         if number == newest.number:
             return newest, False
@@ -196,7 +196,7 @@ class Intents:
         return type(self.newest.action) is Land and not self.newest.over
 
     def stop(self, command: Command) -> None:
-        """Handle an emergency stop, which is executed regardless of its sequence number and ends all requests."""
+        """Handle an emergency stop. The stop is executed regardless of its sequence number, and ends all requests."""
         assert type(command.action) is EmergencyStop
         self.seq, self._received = max(self.seq, command.seq), max(self._received, command.intent)
         self.end(Fate.EMERGENCY)
@@ -211,8 +211,8 @@ class StatePolicy(Enum):
     """How to handle an action in a given flight state."""
 
     APPLY = auto()
-    HOLD = auto()  #: accept it without effect, because the state has been reached or a manoeuvre continues
-    HOVER = auto()  #: for a take-off requested in flight, hover instead
+    HOLD = auto()  #: accept the action without effect, because the state has been reached or a manoeuvre continues
+    HOVER = auto()  #: if a take-off is requested in flight, hover instead
     REFUSE = auto()
 
 
@@ -224,7 +224,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: If the state is unknown, all actions are passed on, because some vehicles never report it.
+#: In an unknown state, all actions are passed on, because some vehicles never report their state.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -252,7 +252,7 @@ class Decision(NamedTuple):
 class CommandChecks:
     """Decides how to handle the commands for one vehicle.
 
-    ``supported``: the actions of the vehicle and the software autopilot; ``native``: those of the vehicle itself;
+    ``supported``: the actions of the vehicle and the software autopilot. ``native``: the actions of the vehicle itself.
     ``why_not``: readable reasons why other actions are not available.
     """
 
@@ -276,12 +276,12 @@ class CommandChecks:
         self._flight = flight
         self._supported = supported
         self._why_not = why_not
-        #: Actions that a person may command while nothing is received from the vehicle. It may still receive us, and
-        #: otherwise only the emergency stop could bring it down.
+        #: Actions that a person may command while nothing is received from the vehicle. The vehicle may still receive
+        #: our commands. Without us, only the emergency stop could bring it down.
         self._unheard = native & {Hover, Land}
 
     def receive(self, command: Command, intents: Intents, app_id: int, now_ns: int) -> Refusal | None:
-        """Check sequence, age, lease and numbers. Returns None if they pass, which renews the holder's lease."""
+        """Check sequence, age, lease and numbers. Returns None if the command passes, which renews the lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
@@ -293,9 +293,9 @@ class CommandChecks:
     def decide(
         self, action: AnyAction, intent: Intent, seen: Snapshot, *, new: bool, automatic: bool = False
     ) -> Decision:
-        """Decide on a command whose intent is in progress, other than an emergency stop or idle.
+        """Decide on a command whose intent is in progress. The command must not be an emergency stop or idle.
 
-        ``new``: whether it is the application's new request, not a repeat or the library's own (``automatic``).
+        ``new``: whether this is a new request, and neither a repeat nor one that the library makes (``automatic``).
         """
         now_ns, state, feedback, link, _ = seen
         kind = type(action)
@@ -305,14 +305,14 @@ class CommandChecks:
         if automatic and (state is FlightState.LANDING or self.keeps_failsafe(kind, seen, automatic=True)):
             policy = StatePolicy.HOLD  # an automatic hover does not abort a landing
         elif kind is Land and link is LinkState.LOST and policy is StatePolicy.HOLD:
-            policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received something else since
+            policy = StatePolicy.APPLY  # the state is outdated: the vehicle may have received other commands since then
         problem = self._problem(action, policy, seen, new=new, automatic=automatic)
         if problem is not None:
             return Decision(None, *problem)
         is_set_point = kind in SET_POINTS
         lands = policy is StatePolicy.HOLD and self._ladder.step is Failsafe.LAND
         if lands and is_set_point and not self.keeps_failsafe(kind, seen, automatic=automatic):
-            policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's
+            policy = StatePolicy.HOVER  # a returning pilot aborts the ladder's landing, but not a pilot's landing
         if policy is StatePolicy.REFUSE:
             return Decision(None, Refusal.WRONG_STATE, explain_state(action, state))
         if policy is StatePolicy.HOLD:
@@ -338,7 +338,7 @@ class CommandChecks:
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def keeps_failsafe(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
-        """Return whether the ladder's task continues, rather than ends, when the holder's command is executed."""
+        """Return whether the ladder's task continues (or else ends) when the holder's command is executed."""
         ladder = self._ladder
         if automatic:
             return ladder.continues_landing or ladder.step is Failsafe.LAND
@@ -347,13 +347,13 @@ class CommandChecks:
         return kind is Hover and ladder.step is Failsafe.HOVER and not (ladder.given_up or seen.link_up)
 
     def _is_judged(self, action: AnyAction, state: FlightState) -> bool:
-        """Return whether the position matters: it does for hovers in flight and for take-offs from the ground."""
+        """Return whether the position matters. It does for hovers in flight and for take-offs from the ground."""
         if type(action) is Hover and self._flight.whose is not Whose.OTHERS:  # a descent would not take over control
             return Velocity in self._supported and state in (FlightState.HOVERING, FlightState.FLYING)
         return type(action) in SET_POINTS or (type(action) is Takeoff and state is FlightState.LANDED)
 
     def begin_return(self, action: ReturnToStart) -> None:
-        """Start a return, replacing any other."""
+        """Start a return, replacing any return in progress."""
         self.way_back = ReturnFlight(action, self.start.position, self.returns)
 
     def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
@@ -362,7 +362,7 @@ class CommandChecks:
         return self.way_back.step(self.airspace, feedback, now_ns)
 
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
-        """Return why the vehicle could not start a return flight that ends in a landing now; empty if it could."""
+        """Return why the vehicle can't start a return flight that ends in a landing now; empty if it can."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
         decision = flight.step(self.airspace.apart(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
@@ -370,7 +370,7 @@ class CommandChecks:
     def _problem(
         self, action: AnyAction, policy: StatePolicy, seen: Snapshot, *, new: bool, automatic: bool
     ) -> tuple[Refusal, str] | None:
-        """Return what forbids a command from the holder, regardless of the policy for the flight state."""
+        """Return the reason that forbids a command from the holder, regardless of the policy for the flight state."""
         state, link = seen.state, seen.link
         kind = type(action)
         unheard = link is LinkState.LOST and kind in self._unheard and not automatic
@@ -401,7 +401,7 @@ class CommandChecks:
 
 
 def explain(reason: Refusal, command: Command, newest_seq: int, *, now_ns: int, max_age_ns: int, lease: int) -> str:
-    """Return why :meth:`Intents.check` refused a command, and what would be right, as readable text."""
+    """Return readable text about why :meth:`Intents.check` refused a command, and what would be right."""
     if reason is Refusal.OUT_OF_SEQUENCE:
         return f"number {command.seq} is not newer than {newest_seq}, the last one received"
     if reason is Refusal.STALE:

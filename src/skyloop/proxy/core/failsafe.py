@@ -1,7 +1,7 @@
-"""The failsafe ladder, which decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
+"""The failsafe ladder. It decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
 
-Steps escalate automatically (none, hover, land), and end only with a fresh command or on the ground. The vehicle may
-first fly back to its start, if parameters require that and nothing prevents it. ``docs/proxy.md`` has the rules.
+Steps escalate automatically (none, hover, land). The steps end only with a fresh command or on the ground. The vehicle
+may first fly back to its start, if parameters require this and nothing prevents it. ``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Final
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 
-#: The charge must rise this far above a level before falling below it counts again.
+#: The charge must rise this far above a level before a fall below that level counts again.
 BATTERY_REARM: Final = 0.05
 
 #: Reasons for steps, as readable text.
@@ -32,11 +32,11 @@ REASONS: Final = {
 _RANK: Final = {Failsafe.NONE: 0, Failsafe.HOVER: 1, Failsafe.LAND: 2}
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
 _LAND_AT_START: Final = ReturnToStart(land=True)
-#: States that prove that an action accepted by the driver did not reach the vehicle.
+#: States that prove that an action which the driver accepted did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
-    ReturnToStart: frozenset(),  # the return is steered all the way
+    ReturnToStart: frozenset(),  # the whole return is steered
 }
 
 
@@ -52,45 +52,45 @@ class FailsafeSettings:
     retry_s: float = 0.25
     battery_warn: float = 0.2
     battery_land: float = 0.1  #: charge at which to land; 0: never
-    battery_return: float = 0.0  #: charge at which to return; 0: never
+    battery_return: float = 0.0  #: battery charge at which to return; 0: never
     returns: bool = False  #: whether a vehicle without a pilot lands at its start
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeInputs:
-    """Inputs for the ladder's decisions."""
+    """What the ladder's decisions are based on."""
 
     state: FlightState
     airborne: bool
-    last_command_ns: int  #: when the last valid command arrived from any holder
+    last_command_ns: int  #: time at which the last valid command arrived from any holder
     pilot: str  #: ``held``, or why there is no holder: ``released``, ``silent``, ``gone``, ``expired``, ``none``
     link_up: bool  #: whether the link from proxy to vehicle is up
     battery: float | None
     ours: bool = True  #: whether an application of this proxy started the flight or took it over
-    return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can, or need not
-    shown: bool = True  #: whether the state is current; False: the last state of a vehicle no longer received
+    return_problem: str = ""  #: readable reason why the vehicle can't return to its start; empty if it can or need not
+    shown: bool = True  #: whether the state is current; if False, the vehicle is no longer received
 
 
 @dataclass(frozen=True, slots=True)
 class StepChange:
-    """A step that began or ended, to be published."""
+    """The start or end of a failsafe step, ready to be published."""
 
     step: Failsafe
     reason: str
     returns: bool = False  #: whether the vehicle flies back to its start and lands there
-    why: str = ""  #: readable reason why it does not return although it should
+    why: str = ""  #: readable reason why the vehicle does not fly back although it should
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryLow:
-    """The battery fell below the warning level; published once."""
+    """The battery charge fell below the warning level. Published once."""
 
     battery: float
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeAction:
-    """An action for the vehicle; report the result with :meth:`FailsafeLadder.attempted`."""
+    """An action for the vehicle. Report its result with :meth:`FailsafeLadder.attempted`."""
 
     action: FailsafeTask
 
@@ -101,9 +101,9 @@ Effect = StepChange | BatteryLow | FailsafeAction
 def due(
     now_ns: int, inputs: FailsafeInputs, settings: FailsafeSettings, *, barred: str, battery_low: bool
 ) -> tuple[Failsafe, str]:
-    """Return the step that is due for our own flight, and the reason, according to time, battery and link.
+    """Return the step that is due for a flight of the proxy, and the reason, based on time, battery and link.
 
-    ``battery_low``: whether the charge is too low to continue without a return, and the pilot has not overruled that.
+    ``battery_low``: whether the charge is too low to continue without a return, unless the pilot has overruled this.
     """
     if barred:
         return Failsafe.LAND, barred
@@ -129,29 +129,29 @@ class FailsafeLadder:
         self.settings = settings or FailsafeSettings()
         self.step = Failsafe.NONE
         self.reason = ""
-        self.barred = ""  #: why set-points are refused at present: ``battery``, ``closing``, or empty
+        self.barred = ""  #: why set-points are currently refused: ``battery``, ``closing``, or empty if they are not
         self._closing = False
         self._warned = False
-        self.battery_low = False  #: whether the charge has fallen below the level for a return and not recovered
-        self._overruled = False  # whether the pilot has overruled a return because of the battery
+        self.battery_low = False  #: whether the charge has fallen below the level for a return and has not recovered
+        self._overruled = False  # whether the pilot has overruled a return that began because of the battery
         self._wanted: FailsafeTask | None = None
         self.given_up = False  #: whether a silent vehicle may still execute an abandoned hover or pilot's landing
-        self.wanted_ns = 0  #: when the current task began
+        self.wanted_ns = 0  #: time at which the current task began
         self._taken = False
         self._next_try_ns = 0
 
     def update(self, now_ns: int, inputs: FailsafeInputs) -> list[Effect]:
-        """Take the steps that are due. Call at a steady pace, and at once after relevant changes."""
+        """Perform the steps that are due. Call at a steady pace, and immediately after relevant changes."""
         effects = self._battery(inputs)
         self.given_up &= inputs.airborne and not inputs.link_up
         if not inputs.airborne:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, inputs.state.value)
-        if not inputs.ours:  # leave a flight by others alone, whatever its problems
+        if not inputs.ours:  # leave a flight by others alone, whatever problems it has
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
-        told = inputs  # the driver may not report a pilot's continued landing yet
+        told = inputs  # the driver may not report yet that a pilot continues a landing
         if isinstance(self._wanted, Land) or self.given_up:  # only a landing can follow
             told = replace(inputs, state=FlightState.LANDING)
         step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
@@ -163,11 +163,11 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers continue a landing only while requested
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers land only while asked to
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
-        """End the step after a fresh command from the pilot, unless the vehicle lands for a lasting reason."""
+        """End the step after a fresh command from the pilot, unless the vehicle is landing for a lasting reason."""
         if self.barred:
             return []
         self._overruled |= self.lands_for_battery
@@ -186,7 +186,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery; a pilot's decision ends that, a set-point does not."""
+        """Whether it returns or lands because of a low battery. A pilot's decision ends this; a set-point doesn't."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
@@ -196,35 +196,35 @@ class FailsafeLadder:
 
     @property
     def continues_landing(self) -> bool:
-        """Whether the ladder continues a pilot's landing."""
+        """Whether the ladder is continuing a pilot's landing."""
         return isinstance(self._wanted, Land) and self.step is Failsafe.NONE
 
     @property
     def lands(self) -> bool:
-        """Whether it makes the vehicle land, here or at its start, no matter who requested that."""
+        """Whether the intent makes the vehicle land, here or at its start, no matter who requested the landing."""
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:
-        """Continue a landing whose pilot has left, or while the vehicle link is lost."""
+        """Continue a landing whose pilot has left, or a landing during a loss of the vehicle link."""
         if not self.lands:
             self._want(Land(), now_ns)
 
     @property
     def acts(self) -> bool:
-        """Whether the ladder makes the vehicle hover or land."""
+        """Whether the ladder is making the vehicle hover or land."""
         return self._wanted is not None
 
     def give_up(self) -> None:
-        """Abandon a hover or a pilot's landing; a silent vehicle is made to land only if its pilot is silent, too."""
+        """Abandon a hover or a pilot's landing. A silent vehicle is made to land only if its pilot is silent, too."""
         self._wanted, self.given_up = None, True
 
     def order_landing(self) -> None:
-        """Land because the proxy is about to end; from now on, only landings and emergency stops are accepted."""
+        """Land because the proxy is about to end. From now on, accept only landings and emergency stops."""
         self._closing = True
         self.barred = "closing"
 
     def attempted(self, taken: bool) -> None:
-        """Record whether the driver accepted the last :class:`FailsafeAction`; if not, retry after ``retry_s``."""
+        """Record whether the driver accepted the last :class:`FailsafeAction`. If not, retry after ``retry_s``."""
         self._taken = taken
 
     def _battery(self, inputs: FailsafeInputs) -> list[Effect]:
@@ -252,7 +252,7 @@ class FailsafeLadder:
         return not self.barred and (reason == "battery_return" or self.settings.returns)
 
     def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:
-        """Begin a step, or change how it ends."""
+        """Begin a step, or change how the step ends."""
         self.step, self.reason = change.step, change.reason
         landing = _LAND_AT_START if change.returns else Land()
         self._want(landing if change.step is Failsafe.LAND else Hover(), now_ns)

@@ -1,8 +1,8 @@
-"""Track one flight: whether the vehicle is flying, whose flight it is, and how sure that is. Pure: time is an argument.
+"""Track one flight: whether the vehicle flies, whose flight it is, and how certain that is. Pure: time is an argument.
 
-The proxy steers only for a new intent of an application, or to end a flight that it started itself. Arming, flying,
-mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle reports
-it, never because of time alone. ``docs/proxy.md`` describes the rules.
+The proxy steers only for a new intent of an application, or to end a flight that the proxy itself started. Arming,
+flying, mode changes and landings by others are observed, reported, and left alone. A flight is over when the vehicle
+reports that it is, never just because time has passed. ``docs/proxy.md`` describes the rules.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ from skyloop.messages import (
     Velocity,
 )
 
-#: A requested take-off that has no visible effect within this time is no longer ours; drivers give up sooner.
+#: If a requested take-off has no visible effect after this time, no flight is attributed to it. Drivers give up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
-#: If the vehicle rises in spite of a cancelled take-off, it does so within this time.
+#: If the vehicle takes off although the take-off was cancelled, it does so within this time.
 CALLED_OFF_NS: Final = nanoseconds(3.0)
-#: A flight is over after this time on the ground, so that bounces and brief false reports don't end it.
+#: A flight is over after this time on the ground. Shorter bounces and brief false reports therefore don't end a flight.
 STANDING_NS: Final = nanoseconds(1.0)
-#: How long a flight that can't be observed counts as this proxy's; after that, it may be a different one.
+#: How long a flight that can't be observed still counts as this proxy's. After that, it may be a different flight.
 BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
-AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this [m]
-STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent that makes no progress has reached the ground [m]
+AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this height [m]
+STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent without progress has reached the ground [m]
 STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
-BLIND_NS: Final = 15 * NS_PER_S  #: duration after which the result of a landing without sensor data is unknown
+BLIND_NS: Final = 15 * NS_PER_S  #: after this time, the result of a landing without sensor data is unknown
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _AIRBORNE: Final = frozenset(state for state in FlightState if state.airborne)
@@ -50,19 +50,19 @@ class Whose(Enum):
     """Who started the flight, or has taken it over."""
 
     NOBODYS = auto()  #: as far as is known, the vehicle is not flying
-    OURS = auto()  #: an application of this proxy, or the proxy itself to end an application's flight
+    OURS = auto()  #: an application of this proxy, or the proxy itself while it ends that application's flight
     OTHERS = auto()  #: a remote control, a ground station or another program
 
 
 class Changed(NamedTuple):
-    """The flight has changed hands. ``why`` is the text to publish, empty if already published."""
+    """The flight has changed hands. ``why`` is the text to publish; it is empty if the change was already published."""
 
     whose: Whose
     why: str = ""
 
 
 class Snapshot(NamedTuple):
-    """The known state of the vehicle for one decision, read once and passed on."""
+    """The known state of the vehicle for one decision. The snapshot is read once and passed on."""
 
     now_ns: int
     state: FlightState
@@ -72,7 +72,7 @@ class Snapshot(NamedTuple):
 
 
 class Flight:
-    """The known state of one vehicle's flight; if the flight is ``shared``, others may fly the vehicle as well.
+    """The known state of one vehicle's flight. If the flight is ``shared``, others may fly the vehicle as well.
 
     :meth:`state` and :meth:`flies` acquire no lock and change nothing, so any thread may call them. Everything else is
     called under the command handler's lock. A vehicle steered in software without ``native`` take-off and landing has
@@ -84,24 +84,24 @@ class Flight:
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
         self.left_to = ""  #: what others made the vehicle do, as the driver reports it
-        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air counts as an old run's
+        self._believed_until_ns: int | None = None  # until then, a vehicle in the air is assumed to be on an old flight
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
-        self._grounded_ns: int | None = None  # start of the current period on the ground
+        self._grounded_ns: int | None = None  # start of the current period of time on the ground
         self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
         self._state = FlightState.LANDED  # the steered task, or the state of a vehicle without a concept of flight
-        self._begun_ns = 0  # when the steered task began
-        self._was_up = False  # whether the vehicle has reported being in the air while steered
-        self._landed_ns: int | None = None  # when it first reported being landed while steered
+        self._begun_ns = 0  # time at which the steered task began
+        self._was_up = False  # whether the vehicle has reported being in the air while it was steered
+        self._landed_ns: int | None = None  # time at which the vehicle first reported being landed while steered
         self._seen = False  # whether an altitude has been received
         self._lowest, self._lowest_ns = math.inf, 0
-        self._blind_ns: int | None = None  # when a landing lost its sensor data
+        self._blind_ns: int | None = None  # time at which a landing lost its sensor data
         self._sent_up = False  # whether the newest action makes the vehicle fly
-        self._seen_up = False  # whether it has been seen in the air, and not on the ground since
+        self._seen_up = False  # whether the vehicle has been seen in the air and, since then, not on the ground
 
-    # Does it fly? ------------------------------------------------------------------------------------------------
+    # Whether it flies -------------------------------------------------------------------------------------------
 
     def state(self, reported: FlightState) -> FlightState:
-        """Return the flight state, given the one reported by the driver. Thread-safe."""
+        """Return the flight state, given the state reported by the driver. Thread-safe."""
         state = self._state
         if reported is FlightState.EMERGENCY:
             return reported
@@ -116,21 +116,21 @@ class Flight:
         return state
 
     def flies(self, state: FlightState) -> bool:
-        """Return whether the vehicle flies, or may fly, in a state returned by :meth:`state`. Thread-safe.
+        """Return whether the vehicle flies, or may be flying, in a state returned by :meth:`state`. Thread-safe.
 
-        In an unknown state, it counts as flying if it was seen flying or has been commanded to fly.
+        In an unknown state, the vehicle counts as flying if it was seen flying or has been commanded to fly.
         """
         return state in _AIRBORNE or (state is FlightState.UNKNOWN and (self._seen_up or self._sent_up))
 
     def may_begin(self, now_ns: int) -> bool:
-        """Return whether a take-off has no visible effect yet, so that a vehicle on the ground may be about to fly."""
+        """Return whether a take-off has had no visible effect yet. A vehicle on the ground may then be about to fly."""
         return self._claimed_until_ns is not None and now_ns < self._claimed_until_ns
 
-    # Whose is it? ------------------------------------------------------------------------------------------------
+    # Whose flight it is ------------------------------------------------------------------------------------------
 
     @property
     def ours(self) -> bool:
-        """Whether the proxy may hold, land or stop the vehicle on its own initiative."""
+        """Whether the proxy may make the vehicle hover, land or stop on its own initiative."""
         return self.whose is Whose.OURS
 
     @property
@@ -144,7 +144,7 @@ class Flight:
 
     @property
     def awaited(self) -> bool:
-        """Whether a flight from an earlier run may still turn up."""
+        """Whether a flight from an earlier run may still be discovered."""
         return self._believed_until_ns is not None
 
     def began_before(self, until_ns: int) -> None:
@@ -152,22 +152,22 @@ class Flight:
         self._believed_until_ns = until_ns
 
     def claim(self, now_ns: int) -> None:
-        """Record a requested take-off, so that the resulting flight is ours."""
+        """Record that a take-off was requested, so that the resulting flight counts as the proxy's."""
         self._claimed_until_ns = now_ns + CLAIM_NS
         if self.whose is Whose.NOBODYS:
             self.whose = Whose.OURS
 
     def call_off(self, now_ns: int) -> None:
-        """Record that a take-off has been cancelled before it had a visible effect."""
+        """Record that a take-off was cancelled before it had a visible effect."""
         if self._claimed_until_ns is not None:
             self._claimed_until_ns = min(self._claimed_until_ns, now_ns + CALLED_OFF_NS)
 
     def take(self) -> None:
-        """Record that an application's new intent was executed; from now on, the flight is ours."""
+        """Record that an application's new intent was executed. From now on, the flight belongs to the proxy."""
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Assume that a vehicle found in the air from now on may be on another flight; return whether it may."""
+        """Assume from now on that a vehicle found in the air may be on another flight; return whether it may be."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared
@@ -186,8 +186,8 @@ class Flight:
     ) -> Changed | None:
         """Observe the vehicle.
 
-        ``left_to``: what others have made the vehicle do since we last steered, according to the driver. ``feedback``:
-        the newest sample, if it is fresh and the link is up; otherwise None.
+        ``left_to``: what others have made the vehicle do since the proxy last steered it, according to the driver.
+        ``feedback``: the newest sample, if it is fresh and the link is up; otherwise None.
         """
         if self._has_no_notion and not self._steered and feedback is not None:
             self._observe_unsteered(reported, left_to, feedback.altitude_m)
@@ -212,7 +212,7 @@ class Flight:
         return None if self.whose is before else Changed(self.whose, self._change_text(before))
 
     def _observe_unsteered(self, reported: FlightState, left_to: str, altitude: float | None) -> None:
-        """Observe a vehicle without a concept of flight while it is not steered."""
+        """Observe a vehicle without a concept of flight while it is not being steered."""
         begins_high = not self._seen and (altitude or 0.0) > AIRBORNE_ALTITUDE
         if reported is FlightState.LANDED:
             if not left_to and self._state is not FlightState.EMERGENCY:  # otherwise a pilot bypasses the driver
@@ -233,7 +233,7 @@ class Flight:
 
     def _change_text(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver has said who took over, the flight is over, or no one else can fly the vehicle
+            return ""  # the driver has reported who took over, the flight has ended, or no one else can fly the vehicle
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy started before its restart"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
@@ -247,7 +247,7 @@ class Flight:
             self._seen_up = False
 
     def steer(self, state: FlightState, now_ns: int) -> None:
-        """Record that the software autopilot is starting the task with this state."""
+        """Record that the software autopilot is starting the task that this state stands for."""
         if not self._steered:
             self._was_up, self._landed_ns = False, None
         self._steered, self._state, self._begun_ns = True, state, now_ns
@@ -264,7 +264,7 @@ class Flight:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
     def refused(self, reported: FlightState) -> bool:
-        """Handle a refusal by the vehicle; return whether it ends a take-off from the ground."""
+        """Handle a refusal by the vehicle. Return whether the refusal ends a take-off from the ground."""
         if not (self._steered and self._state is FlightState.TAKING_OFF and reported is FlightState.LANDED):
             return False
         self._steered, self._state = False, FlightState.LANDED
@@ -275,11 +275,11 @@ class Flight:
         return not self._has_no_notion or self._was_up or reported is not FlightState.LANDED
 
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
-        """Return whether the steered task has ended on the ground, so that the vehicle is no longer steered.
+        """Return whether the steered task has ended on the ground, in which case the vehicle is no longer steered.
 
-        If the vehicle reports its state, that report counts. Otherwise, a descent has reached the ground when the
-        altimeter reads a low altitude and shows no progress. A landing with neither continues for :data:`BLIND_NS`, and
-        its result is unknown. ``feedback``: as in :meth:`observe`.
+        If the vehicle reports its state, that report decides. Otherwise, a descent has reached the ground when the
+        altimeter reads a low altitude and shows no progress. A landing with neither report nor altimeter continues for
+        :data:`BLIND_NS`, and its result is unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:
@@ -287,7 +287,7 @@ class Flight:
             return False
         if reported is FlightState.LANDED:
             self._landed_ns = now_ns if self._landed_ns is None else self._landed_ns
-            # The vehicle may be about to rise, so reports from before the command prove nothing.
+            # The vehicle may be about to take off, so reports from before the command prove nothing.
             since_ns = self._begun_ns if self._state in _MANOEUVRES else self._landed_ns
             patience_ns = CLAIM_NS if self._state is FlightState.TAKING_OFF else STANDING_NS
             ended = now_ns - since_ns >= (0 if self._was_up else patience_ns)

@@ -1,8 +1,8 @@
 """The transport within one host: a Unix ``SOCK_SEQPACKET`` connection per application, and sealed shared memory.
 
-The kernel keeps packets whole, reports at once when the other end dies, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later; on other systems, no proxies are listed, and using anything else here
-raises :class:`UnsupportedError`.
+The kernel keeps packets whole, reports the death of the other end at once, checks who may connect, and leaves nothing
+behind after a crash. The transport needs Linux 5.1 or later. On other systems, no proxies are listed, and any other use
+of this package raises :class:`UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ __all__ = ["LocalServer", "dial", "list_names", "names_of_others"]
 def dial(name: str, *, group: str | None = None) -> Dialer:
     """Return a dialer for a proxy on this host. ``group``: users who share its directory (default: ``SKYLOOP_GROUP``).
 
-    The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if it does not accept
-    the connection (it was killed, is stopped, or belongs to another user). It returns or raises within about a second.
+    The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if the proxy does not
+    accept the connection (it was killed, is stopped, or is another user's). It returns or raises within about a second.
     """
     _check_platform()
     from skyloop.transport.local.client import LocalClient
@@ -53,10 +53,10 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """List by name the running proxies on this host that this user can reach; none on systems other than Linux.
+    """Return the names of the running proxies on this host that this user can reach; none on systems other than Linux.
 
-    Removes sockets left by killed proxies. ``group``: as for :func:`dial`. Raises :class:`LinkError` if the directory
-    of sockets is not safe.
+    Removes the sockets that killed proxies left behind. ``group``: as for :func:`dial`. Raises :class:`LinkError` if
+    the directory of sockets is not safe.
     """
     if sys.platform != "linux":
         return []
@@ -66,7 +66,7 @@ def list_names(*, group: str | None = None) -> list[Proxy]:
 
 
 def names_of_others() -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user. This user can't reach them."""
+    """Return the names of other users' proxies on this host, by user. This user can't reach these proxies."""
     if sys.platform != "linux":
         return {}
     from skyloop.transport.local.directory import directory_owner, of_others

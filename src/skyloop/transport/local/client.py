@@ -24,22 +24,22 @@ from skyloop.transport.local import packets
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
-_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's
+_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's packet
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
-_RETRY_S: Final = 0.25  # interval of retries for packets that did not fit into a full socket
-_CHECK_S: Final = 0.05  # how often a leading thread checks whether its wait is over if nothing arrives
-_STAND_BY_S: Final = 0.002  # how long no thread receives after the leading thread has returned with its sample
+_RETRY_S: Final = 0.25  # interval between retries for packets that did not fit into a full socket
+_CHECK_S: Final = 0.05  # interval at which a leading thread checks whether its wait is over if nothing arrives
+_STAND_BY_S: Final = 0.002  # how long no other thread receives after the leading thread has returned with its sample
 _MAX_CAPACITY: Final = 1 << 31  # maximum memory that a client maps for a server
 _log = logging.getLogger(__name__)
 
 
 class LocalClient(TransportClient):
-    """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`; it receives at once."""
+    """An application's end, made by the dialer from :func:`skyloop.transport.local.dial`. It receives at once."""
 
-    # The thread that holds ``_turn`` receives and delivers: the receiving thread, or an application's thread that waits
-    # for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing it to another thread takes
-    # a second wake-up, which costs as much as the whole path from the proxy. While a thread leads, the receiving thread
-    # stands by; it takes over once no thread has received for two milliseconds.
+    # The thread that holds ``_turn`` receives and delivers. It is either the receiving thread or an application's
+    # thread that waits for a sample and *leads* meanwhile, so that the sample wakes only that thread. Handing the
+    # packet to another thread takes a second wake-up, which costs as much as the whole path from the proxy. While a
+    # thread leads, the receiving thread stands by. It takes over once no thread has received for two milliseconds.
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -52,17 +52,17 @@ class LocalClient(TransportClient):
         self._closing = False
         self._reason = ""
         self._turn = threading.Lock()
-        self._receiver = 0  # identity of the thread that holds the turn
-        self._ended = ""  # why receiving has ended; empty if it has not
-        self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to lead
-        self._releases: deque[bytes] = deque()  # packets that release frames dropped during a delivery
+        self._receiver = 0  # identity of the thread that holds ``_turn``
+        self._ended = ""  # readable reason why receiving has ended; empty while it continues
+        self._candidate: Callable[[], None] | None = None  # wakes a thread that is ready to start receiving
+        self._releases: deque[bytes] = deque()  # packets that release frames that were dropped during a delivery
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
         leave_to_parent(self)
 
     def forked(self) -> None:
-        """Drop a forked child's copy of the connection, without a shutdown, which would end the parent's, too."""
+        """Close a forked child's copy of the connection. A shutdown would also end the parent's connection."""
         sock, self._socket = self._socket, None
         self._ended = "the connection belongs to the parent process"
         if sock is not None:
@@ -116,7 +116,7 @@ class LocalClient(TransportClient):
         return self._address
 
     def _end(self, reason: str) -> None:
-        """End the connection. Idempotent; the receiving thread does the rest."""
+        """End the connection. Idempotent. The receiving thread does the rest."""
         sock = self._socket
         if sock is not None and not self._closing:
             self._reason = reason
@@ -126,12 +126,12 @@ class LocalClient(TransportClient):
     def _release(self, slot: int) -> None:
         packet = packets.release(slot)
         if self._receiver == threading.get_ident():
-            self._releases.append(packet)  # sent after the delivery, which another thread is waiting for
+            self._releases.append(packet)  # sent after the delivery, because another thread is waiting for that
         else:
             self._send_own(packet)
 
     def _send_own(self, packet: bytes) -> None:
-        """Send one of the transport's own packets, or queue it if it does not fit now.
+        """Send one of the transport's own packets, or queue the packet if it does not fit now.
 
         The garbage collector may call this on any thread at any point, so it must not acquire a lock.
         """
@@ -149,7 +149,7 @@ class LocalClient(TransportClient):
                 return
         self._unsent.append(packet)
 
-    # --- the receiving thread ---
+    # --- on the receiving thread ---
 
     def _run(self, sock: Socket) -> None:
         while not self._ended:
@@ -174,16 +174,16 @@ class LocalClient(TransportClient):
             _log.exception("the handler of %s failed in closed()", self._address)
 
     def _stand_by(self) -> None:
-        """Wait until no thread leads."""
+        """Wait until no thread is receiving for itself."""
         while not self._ended:
             time.sleep(_STAND_BY_S)
             if not self._turn.locked():
                 return
 
-    # --- the thread that has the turn ---
+    # --- on the thread that has the turn ---
 
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
-        """Deliver until ``over`` returns True or the connection ends.
+        """Deliver packets until ``over`` returns True or the connection ends.
 
         On the application's main thread, an exception raised by a signal handler during the wait propagates from here.
         """
@@ -194,7 +194,7 @@ class LocalClient(TransportClient):
             self._receiver = 0
 
     def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
-        """Deliver until ``over`` returns True or the connection ends; if it ended, return the reason."""
+        """Deliver packets until ``over`` returns True or the connection ends. If it ended, return the reason."""
         receive = sock.recvmsg
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
@@ -210,7 +210,7 @@ class LocalClient(TransportClient):
                 continue  # packets sent earlier still arrive, followed by the end
             except OSError as error:
                 if error.errno is None:
-                    raise  # raised by a signal handler, not the kernel; for example, a TimeoutError
+                    raise  # a signal handler raised this, not the kernel; for example, a TimeoutError
                 return f"receiving failed: {error}"
             kind = packet[5:6]
             try:
@@ -228,7 +228,7 @@ class LocalClient(TransportClient):
                     except (DecodeError, LinkError, OSError) as error:
                         return f"the proxy violates the protocol: {error}"
                     deliver_frame(header, pixels)
-                    del pixels  # otherwise their slot would stay leased until the next packet
+                    del pixels  # otherwise the frame's slot would stay leased until the next packet
                 else:
                     deliver(packet)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
@@ -239,7 +239,7 @@ class LocalClient(TransportClient):
         return self._reason or "closed by the application"
 
     def _control(self, packet: bytes, descriptors: list[int]) -> None:
-        """Handle one of the transport's own packets other than a frame, and close its descriptors."""
+        """Handle one of the transport's own packets other than a frame, and close the packet's descriptors."""
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
@@ -257,12 +257,12 @@ class LocalClient(TransportClient):
                 os.close(descriptor)
 
     def _send_waiting(self, sock: Socket) -> None:
-        """Send the releases from this turn, and packets that did not fit into the socket earlier."""
+        """Send the releases from this turn, and the packets that did not fit into the socket earlier."""
         while self._releases:
             self._unsent.append(self._releases.popleft())
         try:
             while self._unsent:
-                # It stays in the queue until sent, so that later packets can't overtake it.
+                # The packet stays in the queue until it is sent, so that later packets can't overtake it.
                 sock.send(self._unsent[0], SEND_FLAGS)
                 self._unsent.popleft()
         except OSError:
@@ -279,16 +279,16 @@ def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
 
 
 class SlotView:
-    """A client's view of one slot, which is mapped once and read-only."""
+    """One client's view of a slot. The slot is mapped once and is read-only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
     def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
-        """Map the memory, unless it could shrink while it is read; ``fd`` still belongs to the caller."""
+        """Map the memory, unless it could shrink while it is read. The caller still owns ``fd``."""
         self.number = number
         self.camera = camera
         self.capacity = capacity
-        self.held = held  #: numbers of all of this camera's slots that the application holds
+        self.held = held  #: numbers of all slots of this camera that the application holds
         try:
             seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
         except OSError:
@@ -303,7 +303,7 @@ class SlotView:
         self._interface = self._describe(capacity)
 
     def interface(self, size: int) -> dict[str, Any]:
-        """Return NumPy's description of the first ``size`` bytes; it is cached until the size changes."""
+        """Return NumPy's description of the first ``size`` bytes. It is cached until the size changes."""
         if self._interface["shape"][0] != size:
             self._interface = self._describe(size)
         return self._interface
@@ -313,7 +313,7 @@ class SlotView:
 
 
 class Lease:
-    """Owns a frame's pixels: as long as any array over them exists, the server does not reuse the slot."""
+    """Owns a frame's pixels. As long as any array over the pixels exists, the server does not reuse the slot."""
 
     __slots__ = ("__array_interface__", "_leases", "_slot")
 
@@ -327,10 +327,10 @@ class Lease:
 
 
 class Leases:
-    """A client's slots. The garbage collector may call :meth:`released` on any thread at any point."""
+    """The slots of one client. The garbage collector may call :meth:`released` on any thread at any point."""
 
-    #: Number of a camera's frames that an application may hold in place. Further ones are copied, so that an
-    #: application that collects frames does not exhaust the server's limit and starve itself.
+    #: Number of a camera's frames that an application may hold in place. Further frames are copied, so that an
+    #: application that collects frames does not use up all slots of the server and starve itself.
     IN_PLACE: Final = 3
 
     def __init__(self, send_release: Callable[[int], None]) -> None:
@@ -339,7 +339,7 @@ class Leases:
         self._held: dict[int, set[int]] = {}
 
     def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot announced by the server; ``fd`` still belongs to the caller."""
+        """Map a slot that the server announced. The caller still owns ``fd``."""
         self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
 
     def retire(self, camera: int, before: int) -> None:
@@ -349,16 +349,16 @@ class Leases:
                 del self._slots[slot.number]
 
     def end(self) -> None:
-        """Forget all slots at the end of the connection; frames that the application still holds stay valid.
+        """Forget all slots at the end of the connection. Frames that the application still holds stay valid.
 
-        Those frames refer to this object, and the garbage collector does not search arrays for cycles. So a reference
-        from here to the client, its handler and the frames that it keeps would keep all of them alive forever.
+        Those frames refer to this object, and the garbage collector does not search arrays for cycles. A reference from
+        here to the client, its handler and the frames that it stores would therefore keep all of them alive forever.
         """
         self._slots.clear()
         self._send_release = lambda _: None
 
     def pixels(self, number: int, size: int) -> Pixels:
-        """Return a slot's frame: in place, or as a copy if the application already has :attr:`IN_PLACE` frames."""
+        """Return a slot's frame: in place, or as a copy if the application already holds :attr:`IN_PLACE` frames."""
         slot = self._slots.get(number)
         if slot is None or not 0 <= size <= slot.capacity:
             raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")
@@ -371,6 +371,6 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """Return a slot to the server, now that the application's last array over it is gone."""
+        """Return a slot to the server, because the application's last array over it no longer exists."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)

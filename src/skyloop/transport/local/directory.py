@@ -1,14 +1,14 @@
-"""The directory of sockets, in which proxies are found by name, and its access rules.
+"""The directory of sockets, where proxies are found by name, and its access rules.
 
-Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter. It is given
-by the variable ``SKYLOOP_RUNTIME_DIR``; the default is ``skyloop`` in the user's runtime directory. A process that
-changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is on the
-directory itself or, if a group may read the directory, on the file ``.lock`` in it, which only the owner can open, so
-that members of the group can't block a proxy. Reading needs no lock.
+Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
+The variable ``SKYLOOP_RUNTIME_DIR`` sets the directory. The default is ``skyloop`` in the user's runtime directory. A
+process that changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is
+on the directory itself. If a group may read the directory, the lock is on the file ``.lock`` in it, which only the
+owner can open, so that members of the group can't block a proxy. Reading needs no lock.
 
 The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket reveals whether a
-process is still listening: the kernel answers at once, without the owner noticing, with ``EPROTOTYPE`` for a live
-socket and ``ECONNREFUSED`` for a dead one.
+process is still listening. The kernel answers at once, without the owner noticing: ``EPROTOTYPE`` for a live socket and
+``ECONNREFUSED`` for a dead one.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
 PROXY: Final = "proxy"
-HOST: Final = "host"  #: a host for many proxies, whose socket accepts requests to add and remove vehicles
+HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
-_OPEN_TO_OTHERS: Final = 0o027  # permissions: writable by the group, or any access for others
+_OPEN_TO_OTHERS: Final = 0o027  # file permissions: writable by the group, or any access for others
 
 
 class Proxy(NamedTuple):
@@ -47,7 +47,7 @@ class Proxy(NamedTuple):
 
     name: str
     pid: int | None  #: process id; None if the process is too busy to report it
-    path: Path  #: path of its socket
+    path: Path  #: path of the server's socket
 
 
 class Directory:
@@ -60,7 +60,7 @@ class Directory:
         self._suffix = _SUFFIXES[kind]
 
     def socket_path(self, name: str) -> Path:
-        """Return the path of a proxy's socket, which must not be longer than :data:`MAX_PATH`."""
+        """Return the path of a proxy's socket. The path must not be longer than :data:`MAX_PATH`."""
         check_name(name)
         path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
@@ -81,7 +81,7 @@ class Directory:
         self.check()
 
     def check(self) -> None:
-        """Check that no other user can put a socket here; ``FileNotFoundError`` if there is no such directory."""
+        """Check that no other user can put a socket here; ``FileNotFoundError`` if the directory does not exist."""
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
         if not stat.S_ISDIR(here.st_mode):
             raise LinkError(f"{self.path} is not a directory: remove it, or set {DIRECTORY_VARIABLE} to another one")
@@ -104,7 +104,7 @@ class Directory:
             )
 
     def proxies(self) -> list[Proxy]:
-        """List the running proxies by name, and remove sockets left by killed ones."""
+        """List the running proxies by name, and remove the sockets that killed proxies left behind."""
         try:
             self.check()
         except FileNotFoundError:
@@ -121,15 +121,15 @@ class Directory:
         return found
 
     def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy, unless the lock is held, because a reader never waits."""
+        """Remove the socket of a killed proxy. Skip this if the lock is held, because a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
-            return  # members of a group may read the directory, but not remove anything
+            return  # members of a group may read the directory, but can't remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
-            if not is_live(path):  # a proxy may have taken the name since
+            if not is_live(path):  # a new proxy may have taken the name since then
                 path.unlink()
 
     def listen(self, name: str) -> tuple[Socket, int]:
-        """Listen under a name, replacing a killed proxy; return the socket, and its file's inode for :meth:`remove`."""
+        """Listen under a name, replacing a killed proxy. Return the socket, and its file's inode for :meth:`remove`."""
         path = self.socket_path(name)
         self.create()
         with self.lock():
@@ -149,7 +149,7 @@ class Directory:
             return listener, path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
-        """Remove the socket with this name if its file still has this inode; errors are ignored."""
+        """Remove the socket with this name if its file still has this inode. Errors are ignored."""
         path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
             if path.lstat().st_ino == inode:
@@ -180,7 +180,7 @@ class Directory:
 
 
 def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
-    """Return this user's directory, or the one shared by a group (``SKYLOOP_GROUP``), without touching any file."""
+    """Return this user's directory, or the one that a group shares (``SKYLOOP_GROUP``). No files are touched."""
     group = group or os.environ.get(GROUP_VARIABLE) or None
     configured = os.environ.get(DIRECTORY_VARIABLE)
     if group is not None and not configured:
@@ -203,23 +203,23 @@ def _default_path() -> Path:
     import platformdirs
 
     with warnings.catch_warnings():
-        # Ignore the warning about a missing ``XDG_RUNTIME_DIR``, because the safety of the fallback is checked here.
+        # Ignore the warning about a missing XDG_RUNTIME_DIR: the safety of the fallback directory is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 
 
 def is_live(path: Path) -> bool:
-    """Return whether a process holds the socket at this path."""
+    """Return whether a process still holds the socket at this path."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         code = probe.connect_ex(os.fspath(path))
     return code not in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
-    """Return the names of other users' proxies on this host, by user; we can't open their sockets.
+    """Return the names of other users' proxies on this host, by user. This process can't open their sockets.
 
-    ``table``: the content of ``/proc/net/unix``, where the kernel shows the names of all sockets to every user.
-    ``owner``: returns the user id of a directory's owner; None if unknown.
+    ``table``: the content of ``/proc/net/unix``, where the kernel lists the names of all sockets for every user.
+    ``owner``: returns the user id of a directory's owner; None if the owner is unknown.
     """
     found: dict[str, list[str]] = {}
     for line in table.splitlines():
@@ -234,7 +234,7 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
 
 
 def directory_owner(path: Path) -> int | None:
-    """Return the owner of a directory or, if it is not visible, of its nearest visible parent."""
+    """Return the owner of a directory or, if the directory is not visible, the owner of its nearest visible parent."""
     for folder in (path, *path.parents):
         with contextlib.suppress(OSError):
             return folder.lstat().st_uid
@@ -242,7 +242,7 @@ def directory_owner(path: Path) -> int | None:
 
 
 def owner_pid(path: Path) -> int | None:
-    """Return the id of the process listening at this path; None if it can't be determined at once."""
+    """Return the id of the process that listens at this path; None if it can't be determined immediately."""
     probe = Socket()
     probe.setblocking(False)
     try:
@@ -255,7 +255,7 @@ def owner_pid(path: Path) -> int | None:
 def connect(path: Path) -> Socket:
     """Connect to the socket at this path; ``OSError`` if no process accepts within :data:`CONNECT_TIMEOUT_S`."""
     sock = Socket()
-    # Without a time-out, connecting to a stopped process whose queue is full would block forever.
+    # Without a time-out, connecting to a stopped process with a full queue would block forever.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
     sock.connect(os.fspath(path))
     return sock

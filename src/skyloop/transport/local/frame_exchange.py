@@ -1,8 +1,8 @@
-"""Manage the server's frame slots: which are free, which clients hold them, and which viewers await a frame.
+"""Manage the server's frame slots: which are free, which clients hold them, and which viewers wait for a frame.
 
-A frame is copied once, into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
-:data:`MAX_LEASES` frames, or whose socket is full, is skipped; once it releases a frame, it gets the newest one. The
-slots never run out, because each viewer can hold only a limited number.
+A frame is copied once into a free slot, and each viewer gets a small packet that names the slot. A viewer that holds
+:data:`MAX_LEASES` frames, or whose socket is full, is skipped. Once it releases a frame, it gets the newest frame.
+There is always a free slot, because each viewer can hold only a limited number of slots.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 
-MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, in transit or in use
+MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, including frames in transit
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# Once the server has mapped the memory, it keeps that writeable view; no other can be created, and the size can't be
-# changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
+# Once the server has mapped the memory, it keeps that writeable view. No other writeable view can be created, and the
+# size can't be changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
 class SlotMemory:
-    """One slot at the server: memory for a frame, and the number of its holders."""
+    """One slot at the server: memory for a frame, and the number of holders."""
 
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
@@ -43,9 +43,9 @@ class SlotMemory:
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that hold the slot, plus the server while it writes to it or keeps it for viewers
+        self.holders = 0  #: number of clients that hold the slot, plus the server while it writes or keeps it
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.posix_fallocate(self.fd, 0, capacity)  # fail here if memory is short, rather than during a copy
+        os.posix_fallocate(self.fd, 0, capacity)  # if memory is short, fail here rather than during a copy
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
         self.array: Pixels = np.frombuffer(view, np.uint8)
         fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
@@ -71,7 +71,7 @@ _Newest = tuple[SlotMemory, bytes]
 
 
 class Connection(Protocol):
-    """A viewer's connection; both methods raise ``OSError`` if the packet can't be sent now."""
+    """A viewer's connection. Both methods raise ``OSError`` if the packet can't be sent now."""
 
     def transmit(self, packet: bytes) -> None: ...
 
@@ -85,12 +85,12 @@ class Viewer:
     connection: Connection
     leases: dict[int, SlotMemory] = field(default_factory=dict)
     announced: set[int] = field(default_factory=set)
-    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: none
-    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some
+    retire_before: int = 0  #: slots below this number are retired, and the client must be notified; 0: no slots
+    active: bool = True  #: whether the viewer gets frames; if not, it may still hold some of them
     waits: bool = False  #: whether the viewer was skipped and is waiting for a frame
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
-        """Send a frame, unless the viewer holds enough frames or its socket is full; then mark it as waiting."""
+        """Send a frame. If the viewer holds enough frames or its socket is full, mark it as waiting instead."""
         self.waits = True
         if len(self.leases) >= MAX_LEASES:
             return False
@@ -116,7 +116,7 @@ class Camera:
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
-        self.viewers: dict[Connection, Viewer] = {}  # including inactive ones, which only hold frames
+        self.viewers: dict[Connection, Viewer] = {}  # including inactive viewers, which only hold frames
         self.active: tuple[Viewer, ...] = ()  # viewers that get frames
         self._generation = 0
         self._geometry: object = None
@@ -124,20 +124,20 @@ class Camera:
         self._free: list[SlotMemory] = []
         self._count = 0  # number of slots in this generation
         self._slot_numbers = slot_numbers
-        self._next_number = 0  # higher than the numbers of all slots so far
+        self._next_number = 0  # higher than the numbers of all earlier slots
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
-        """Return a slot to write a frame to; the writer holds it until :meth:`offer`. ``OSError``: out of memory."""
+        """Return a slot for a frame. The writer holds the slot until :meth:`offer`. ``OSError``: out of memory."""
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
-            # The size of compressed frames varies, so when one outgrows its slots, new slots get some spare room.
+            # The size of compressed frames varies. When one outgrows its slots, new slots get some spare room.
             grows = geometry == self._geometry
             self.retire()
             self._geometry = geometry
             self._capacity = 1 << (header.size - 1).bit_length() if grows else max(header.size, 1)
         if self._free:
-            slot = self._free.pop()  # the one freed last is likely still in the processor's cache
+            slot = self._free.pop()  # the slot freed last is probably still in the processor's cache
         else:
             slot = SlotMemory(next(self._slot_numbers), self._generation, self._capacity)
             self._next_number = slot.number + 1
@@ -146,7 +146,7 @@ class Camera:
         return slot
 
     def offer(self, slot: SlotMemory, packet: bytes) -> int:
-        """Send a slot from :meth:`take` to all viewers; return the number of those skipped."""
+        """Send a slot from :meth:`take` to all viewers; return the number of viewers that were skipped."""
         missed = 0
         for viewer in self.active:
             if not viewer.hand(slot, packet, self.number):
@@ -158,13 +158,13 @@ class Camera:
         return missed
 
     def drop(self, slot: SlotMemory) -> None:
-        """Remove one hold on a slot, which is free again if there are no others."""
+        """Remove one hold on a slot. The slot is free again if there are no others."""
         slot.holders -= 1
         if slot.holders == 0 and slot.generation == self._generation:
             self._free.append(slot)
 
     def released(self, viewer: Viewer, number: int) -> bool:
-        """Take a slot back from a viewer, if it holds it, and send it the newest frame if it is waiting for one."""
+        """Take a slot back from a viewer that holds it. If the viewer waits for a frame, send it the newest."""
         slot = viewer.leases.pop(number, None)
         if slot is None:
             return False
@@ -176,27 +176,27 @@ class Camera:
         return True
 
     def subscribe(self, connection: Connection) -> None:
-        """Send frames to a connection, starting with the next one."""
+        """Send frames to a connection from the next frame on."""
         self.viewers.setdefault(connection, Viewer(connection)).active = True
         self._count_active()
 
     def unsubscribe(self, viewer: Viewer) -> None:
-        """Stop sending frames to a viewer; those that it holds stay intact until it releases them."""
+        """Stop sending frames to a viewer. Frames that the viewer holds stay intact until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
-        with contextlib.suppress(OSError):  # if this fails, the client keeps the slots mapped until it ends
+        with contextlib.suppress(OSError):  # if this fails, the slots stay mapped in the client until it ends
             viewer.connection.transmit(packets.retire(self.number, self._next_number))
         self._trim()
 
     def leave(self, connection: Connection) -> None:
-        """Remove a client that is gone, and free all its slots."""
+        """Remove a client that has left, and free all its slots."""
         if (viewer := self.viewers.pop(connection, None)) is not None:
             for slot in viewer.leases.values():
                 self.drop(slot)
             self._trim()
 
     def _trim(self) -> None:
-        """Release memory that the remaining viewers cannot need."""
+        """Release memory that the remaining viewers can't need."""
         self._count_active()
         if not self.active or self._count > (MAX_LEASES * len(self.viewers)) + 2:
             self.retire()
@@ -205,7 +205,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Free the memory of every slot: at once if it is free, otherwise as soon as it is released."""
+        """Free the memory of every slot: immediately if the slot is free, otherwise as soon as it is released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -217,14 +217,14 @@ class Camera:
             viewer.retire_before = self._next_number
 
     def _keep(self, newest: _Newest | None) -> None:
-        """Keep a slot, or none, for waiting viewers; the writer's hold on ``newest`` is passed on to this object."""
+        """Keep a slot, or none, for waiting viewers. This object takes over the writer's hold on ``newest``."""
         before, self._newest = self._newest, newest
         if before is not None:
             self.drop(before[0])
 
 
 class FrameExchange:
-    """Manages all cameras of a server. Thread-safe; frames are copied outside its lock."""
+    """Manages all cameras of a server. Thread-safe. Frames are copied while the lock of the exchange is not held."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -233,7 +233,7 @@ class FrameExchange:
         self._camera_numbers = itertools.count(1)
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Copy a frame once and send it to the camera's viewers; return how many missed it: all if memory ran out."""
+        """Copy a frame once and send it to the camera's viewers; return how many missed it (all if memory ran out)."""
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
             return 0
@@ -249,7 +249,7 @@ class FrameExchange:
             return camera.offer(slot, packet)
 
     def subscribe(self, connection: Connection, name: str) -> None:
-        """Send a camera's frames to a connection, starting with the next one."""
+        """Send a camera's frames to a connection from the next frame on."""
         with self._lock:
             camera = self._cameras.get(name)
             if camera is None:
@@ -263,7 +263,7 @@ class FrameExchange:
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:
-        """Take a slot back from a client; return False if the client did not hold it."""
+        """Take a slot back from a client; return False if the client did not hold the slot."""
         with self._lock:
             for camera in self._cameras.values():
                 viewer = camera.viewers.get(connection)
@@ -272,9 +272,9 @@ class FrameExchange:
         return False
 
     def leave(self, connection: Connection) -> None:
-        """Remove a client that is gone from all cameras."""
+        """Remove a client that has left from all cameras."""
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # recreated for the next viewer, because unused names must not accumulate
+                if not camera.viewers:  # recreated for the next viewer; otherwise unused names would accumulate
                     del self._cameras[name]

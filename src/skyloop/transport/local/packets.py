@@ -15,7 +15,7 @@ from skyloop.messages import FrameHeader, decode
 from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
 from skyloop.transport.base import MAX_TOPIC
 
-REVISION: Final = 1  #: revision of the local transport's own packets
+REVISION: Final = 1  #: revision of the packets that only the local transport uses
 MAX_REASON: Final = 400  #: bytes of UTF-8 in a reason
 
 
@@ -24,15 +24,15 @@ class LocalKind(IntEnum):
 
     HELLO = 0x40  #: a client's first packet
     SUBSCRIBE = 0x41  #: client to server
-    RELEASE = 0x42  #: client to server: the frame in this slot is no longer used
-    SLOT = 0x43  #: server to client, with the slot's descriptor
-    FRAME = 0x44  #: server to client: a slot holds a frame
-    RETIRE = 0x45  #: server to client: a camera's older slots will not be used again
-    BYE = 0x46  #: either direction: why the connection ends
-    WAKE = 0x47  #: client to server: sent before each command by older applications, and ignored
+    RELEASE = 0x42  #: client to server: the client no longer uses the frame in this slot
+    SLOT = 0x43  #: server to client, together with the slot's descriptor
+    FRAME = 0x44  #: server to client: a slot contains a frame
+    RETIRE = 0x45  #: server to client: the older slots of a camera will not be used again
+    BYE = 0x46  #: either direction: the reason why the connection ends
+    WAKE = 0x47  #: client to server: older applications send this before each command, and it is ignored
 
 
-# A packet's sixth byte is its kind, which is compared with these without conversion.
+# A packet's sixth byte is its kind. The byte is compared with these kinds without conversion.
 OWN: Final = bytes([LocalKind.HELLO])  #: packets of this kind and above are the transport's own
 FRAME: Final = bytes([LocalKind.FRAME])
 
@@ -57,7 +57,7 @@ class Release(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """A slot for frames of a camera; ``capacity`` is in bytes."""
+    """A slot for frames of one camera. ``capacity`` is in bytes."""
 
     slot: int
     camera: int
@@ -116,7 +116,7 @@ def slot(number: int, camera: int, capacity: int) -> bytes:
 
 
 def frame(number: int, header: bytes) -> bytes:
-    """Encode a :class:`Frame`; ``header``: the whole packet of its :class:`FrameHeader`."""
+    """Encode a :class:`Frame`. ``header`` is the whole packet of the frame's :class:`FrameHeader`."""
     return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
 
 

@@ -1,13 +1,13 @@
-"""One thread that receives for many local transport servers, which can leave it if one of them blocks it.
+"""One thread that receives for many local transport servers. The others can leave it if one of them blocks it.
 
 A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call fewer, which is
-better for one vehicle. With a hundred vehicles, there would be two hundred threads waking one another. Here, one thread
+better for one vehicle. With a hundred vehicles, however, two hundred threads would wake one another. Here, one thread
 waits for all connections (epoll), reads all available packets, and handles one packet of each connection in turn.
-Landings and stops come first, then set-points, then the rest, but each class gets some turns even if others are busy.
+Landings and stops come first, then set-points, then all others. Each class gets some turns even if others are busy.
 
-Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server and :attr:`Reactor.entries`
+Handlers run on this thread. During a call, :attr:`Reactor.inside` is the handler's server. :attr:`Reactor.entries`
 counts the calls, so that a watchdog can detect a call that does not return. It then calls :meth:`Reactor.split`, which
-leaves this thread to that server and moves all others to a new reactor.
+leaves this thread to that server and moves all other servers to a new reactor.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Socket
 from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
-CHECK_S: Final = 0.5  #: how often to check silent connections, and listeners that could not accept
+CHECK_S: Final = 0.5  #: interval between checks of silent connections, and of listeners that could not accept
 _AFTER_FAILURE_S: Final = 0.01
-_PAUSE_S: Final = 100e-6  # a wait this long means that nothing was pending
+_PAUSE_S: Final = 100e-6  # if a wait took this long, no packet was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
-#: Order of the lanes, turn by turn: even if something is always urgent, the others each get one turn in four.
+#: Order in which the lanes take turns. Even if something is always urgent, the others each get one turn in four.
 _ORDERS: Final = (
     _FIRST_COME,
     (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
@@ -45,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 class Source:
-    """A socket that a reactor waits for: a server's listener (``sock``), or one of its connections."""
+    """A socket that a reactor waits for: a server's listener (``sock``) or one of its connections."""
 
     def __init__(
         self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
@@ -55,20 +55,20 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.lane: Lane | None = None  #: the lane in which the source waits
+        self.lane: Lane | None = None  #: the lane that the source waits in
         self.ended = False
         self.muted = False  #: whether the source is ignored until the next check
 
 
 class _Thread(threading.Thread):
-    """A reactor's thread."""
+    """The thread of a reactor."""
 
 
 class Reactor:
-    """Receives for transport servers on one thread, from construction to :meth:`close`."""
+    """Receives for transport servers on one thread, from construction until :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: SharedLocalServer | None = None  #: the server whose handler is, or may be, running
+        self.inside: SharedLocalServer | None = None  #: the server whose handler is running, or may be running
         self.entries = 0  #: number of times that :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -76,7 +76,7 @@ class Reactor:
         self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._epoll.register(self._waker, select.EPOLLIN)
         self._closing = False
-        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources with packets to handle
+        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources that have packets to handle
         self._resumed: deque[Source] = deque()
         self._turns = 0
         self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
@@ -89,7 +89,7 @@ class Reactor:
             self._epoll.register(source.fileno, select.EPOLLIN)
 
     def remove(self, source: Source) -> bool:
-        """Stop waiting for a socket; return whether this reactor waited for it. Thread-safe."""
+        """Stop waiting for a socket; return whether this reactor was waiting for it. Thread-safe."""
         with self._lock:
             if self._sources.get(source.fileno) is not source:
                 return False
@@ -100,21 +100,21 @@ class Reactor:
 
     @property
     def over(self) -> bool:
-        """Whether its thread has ended, so that nothing is received for its servers."""
+        """Whether the reactor's thread has ended, in which case nothing is received for its servers."""
         return not self._thread.is_alive()
 
     def remaining_of(self, server: SharedLocalServer) -> list[Source]:
-        """Return a server's sockets left over when the thread ended; none while it runs. Thread-safe."""
+        """Return the sockets that a server left over when its thread ended; none while the thread runs. Thread-safe."""
         with self._lock:
             return [source for source in self._sources.values() if source.server is server] if self.over else []
 
     @property
     def empty(self) -> bool:
-        """Whether it has no sockets."""
+        """Whether the reactor has no sockets."""
         return not self._sources
 
     def split(self, stuck: SharedLocalServer) -> Reactor:
-        """Leave this reactor to the server whose handler blocks it; return a new reactor for all others. Thread-safe.
+        """Leave this reactor to the server whose handler blocks it; return a new one for all the others. Thread-safe.
 
         No packet is lost or delivered twice, and the packets of each connection keep their order.
         """
@@ -139,7 +139,7 @@ class Reactor:
         self._wake()
 
     def close(self) -> None:
-        """End the thread after its current work. Stop its servers first. Idempotent."""
+        """End the thread after its current task. Stop its servers first. Idempotent."""
         if not self._closing:
             self._closing = True
             self._wake()
@@ -150,7 +150,7 @@ class Reactor:
         with contextlib.suppress(OSError):
             os.eventfd_write(self._waker, 1)
 
-    # --- its thread ---
+    # --- on its thread ---
 
     def _run(self) -> None:
         checked_s = time.monotonic()
@@ -177,13 +177,13 @@ class Reactor:
                     self._check()
             except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must continue
                 _log.exception("a turn of the receiving thread failed; it continues")
-                time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up the whole processor
+                time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up all processor time
         self.inside = None
         os.close(self._waker)
         self._epoll.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
-        """Read a packet from each socket, to see which are urgent or superseded; return whether more may be waiting."""
+        """Read a packet from each socket to see which are urgent or superseded; return whether more may wait."""
         sources, more = self._sources, False
         for fileno, _ in ready:
             source = sources.get(fileno)
@@ -198,7 +198,7 @@ class Reactor:
         return more
 
     def line_up(self, source: Source, lane: Lane | None) -> None:
-        """Queue a source for a turn in a lane; do nothing if there is no lane. Called on the reactor's thread."""
+        """Queue a source for a turn in a lane; do nothing if the lane is None. Called on the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
@@ -218,13 +218,13 @@ class Reactor:
         self.entries += 1
 
     def mute(self, source: Source) -> None:
-        """Ignore a listener until the next check, because it can't accept but would always be ready."""
+        """Ignore a listener until the next check, because it can't accept connections but would always be ready."""
         source.muted = True
         with self._lock, contextlib.suppress(OSError):
             self._epoll.modify(source.fileno, 0)
 
     def _check(self) -> None:
-        """End connections that have sent nothing, and retry listeners."""
+        """End connections that have sent nothing, and retry listeners that failed."""
         now_s = time.monotonic()
         with self._lock:
             sources = list(self._sources.values())
@@ -241,7 +241,7 @@ class Reactor:
 class SharedLocalServer(LocalServer):
     """A :class:`LocalServer` that shares its receiving thread with others.
 
-    Its handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
+    The handler must return quickly, because a delay affects all of these servers until :meth:`Reactor.split` is called.
     """
 
     def __init__(self, name: str, reactor: Reactor, *, group: str | None = None) -> None:
@@ -251,7 +251,7 @@ class SharedLocalServer(LocalServer):
         self._listening: Source | None = None
         self._inode = 0
         self._served: set[ServerConnection] = set()
-        self._left = threading.Condition()  # guards the set; notified when a connection is gone
+        self._left = threading.Condition()  # guards the set; notified when a connection has ended
 
     def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         listener.setblocking(False)
@@ -273,21 +273,21 @@ class SharedLocalServer(LocalServer):
                 while self._served and not self.reactor.over:
                     self._left.wait(_THREAD_CHECK_S)
             with self._lock:
-                for left in self.reactor.remaining_of(self):  # the thread ended first: nothing else returns these
+                for left in self.reactor.remaining_of(self):  # the thread ended first, and nothing else returns these
                     assert left.connection is not None
                     self._finish_connection(left, left.connection, "the proxy stopped")
 
     def _drop(self, source: Source) -> None:
         """Remove a socket from all reactors."""
         source.ended = True
-        self.reactor.remove(source)  # a socket moving to another reactor is dropped there as soon as it is noticed
+        self.reactor.remove(source)  # if a socket moves to another reactor, this one drops it as soon as it notices
 
-    # --- the reactor's thread ---
+    # --- on the reactor's thread ---
 
     def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
-        """Accept a connection, or read a packet of one; return whether more may be waiting behind it.
+        """Accept a connection, or read a packet from one; return whether more packets may be waiting.
 
-        ``at_once``: nothing else is waiting for this thread, so a command is handled right here rather than by
+        ``at_once``: nothing else is waiting for this thread, so a command is handled right here and not by
         :meth:`deliver`.
         """
         with self._lock:  # held from receiving to handling, so that nothing overtakes this packet after a split
@@ -317,7 +317,7 @@ class SharedLocalServer(LocalServer):
             return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
-        """Handle the first waiting packet of a source from this lane; return the source's next lane."""
+        """Handle the first waiting packet of a source from this lane; return the lane that the source waits in next."""
         with self._lock:
             if not self._is_current(reactor, source) or source.lane is not lane:
                 return None  # the source has become more urgent and moved to that lane
@@ -329,10 +329,10 @@ class SharedLocalServer(LocalServer):
             return None if source.ended else self._lane(source, connection)
 
     def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
-        """Return the lane in which to queue a source; None if nothing waits, or it is in that lane already."""
+        """Return the lane in which to queue a source; None if it has no packets or is already in that lane."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
-            lane = Lane.STEERING  # it will be refused
+            lane = Lane.STEERING  # the request will be refused
         if lane is None or (source.lane is not None and source.lane <= lane):
             return None
         source.lane = lane
@@ -347,7 +347,7 @@ class SharedLocalServer(LocalServer):
             self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
 
     def _is_current(self, reactor: Reactor, source: Source) -> bool:
-        """Return whether this reactor still receives from a source; otherwise pass it on or drop it."""
+        """Return whether this reactor still receives from a source. If not, pass the source on or drop it."""
         if source.ended:
             reactor.remove(source)
             return False
@@ -374,11 +374,11 @@ class SharedLocalServer(LocalServer):
             with self._left:
                 self._served.add(connection)
             reactor.add(Source(self, connection=connection))
-            if self._stopping.is_set():  # connected while the others were being disconnected
+            if self._stopping.is_set():  # an application that connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
-        """Handle one packet, surviving any error of the handler."""
+        """Handle one packet, and survive any error that the handler raises."""
         handler = self._handler
         assert handler is not None
         try:

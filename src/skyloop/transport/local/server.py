@@ -1,9 +1,9 @@
 """The proxy's end of the local transport, with one connection and one receiving thread per application.
 
 A dedicated thread in ``recv`` delivers a packet with one system call. Waiting for all connections at once (epoll) needs
-two, which delayed commands by a third more on an idle machine. The threads take turns calling the handler, so that it
-gets one call at a time as the contract requires: those with a command go first, the others in order of arrival. A
-thread whose turn comes late reads all of its waiting packets, and passes on only the newest of the set-points.
+two calls, which delayed commands by a third more on an idle machine. The threads take turns calling the handler, so
+that it gets one call at a time, as the contract requires. Threads with a command go first, the others in order of
+arrival. A thread whose turn comes late reads all its waiting packets, and passes on only the newest of the set-points.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ from skyloop.transport.local.sockets import Credentials, ServerConnection, Socke
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
-#: Connections allowed per process, so that no program can take them all; a cockpit page that flies has a separate one.
+#: Connections allowed per process, so that no program takes them all. A cockpit page that flies has its own process.
 MAX_PER_PROCESS: Final = 64
-MAX_PER_USER: Final = 64  #: maximum per user with access through a group; the proxy's own user may use all others
-PILOT_PLACES: Final = 32  #: places reserved for pilots
-HELLO_S: Final = 2.0  #: time limit for the first packet, which clients send when they connect
+MAX_PER_USER: Final = 64  #: maximum per user who has access through a group; the proxy's own user may use all others
+PILOT_PLACES: Final = 32  #: connections reserved for pilots
+HELLO_S: Final = 2.0  #: time limit for the first packet, which a client sends when it connects
 _RETRY_ACCEPT_S: Final = 0.2
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
 class LocalServer(TransportServer):
-    """A proxy's end, which is found on this host by its name. It can be started only once.
+    """A proxy's end of the local transport. Clients on this host find it by its name. It can be started only once.
 
     :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
     of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature. ``group``: users who
@@ -58,15 +58,15 @@ class LocalServer(TransportServer):
         check_name(name)
         self._name = name
         self._directory = find_directory(group)
-        self._directory.socket_path(name)  # if the path is too long, raise here rather than on start
+        self._directory.socket_path(name)  # if the path is too long, raise here rather than in ``start``
         self._exchange = FrameExchange()
-        # These are replaced under the lock, never changed in place, so that any thread may read them.
+        # These are replaced under the lock and never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
-        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
+        self._peers: dict[int, ServerConnection] = {}  # the peers, by number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
-        self._lock = PriorityLock()  # a thread must hold it to call the handler
-        self._receivers: set[int] = set()  # identities of the receiving threads
-        self._superseded = 0  # number of commands replaced by newer ones that arrived behind them
+        self._lock = PriorityLock()  # a thread must hold this lock to call the handler
+        self._receivers: set[int] = set()  # identities of the threads that receive
+        self._superseded = 0  # number of commands that were replaced because newer ones arrived behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -101,7 +101,7 @@ class LocalServer(TransportServer):
         self._finish(listener)
 
     def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
-        """Wait until everything has ended."""
+        """Wait until all ends have stopped."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
             thread.join()  # a handler that stops its own server must not wait for itself
@@ -159,7 +159,7 @@ class LocalServer(TransportServer):
     def address(self) -> str:
         return f"local:{self._name}"
 
-    # --- the accepting thread ---
+    # --- on the accepting thread ---
 
     def _run(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
         threads: list[threading.Thread] = []
@@ -176,12 +176,12 @@ class LocalServer(TransportServer):
                 thread.join()
 
     def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
-        """Accept one connection and start receiving from it; return its receiving thread, or None."""
+        """Accept one connection and start receiving from it. Return its receiving thread, or None."""
         try:
             accepted, _ = listener.accept()
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
-                # Out of descriptors or memory: without a pause, this thread would spin.
+                # Out of descriptors or memory: without a pause, this thread would loop without rest.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
@@ -202,7 +202,7 @@ class LocalServer(TransportServer):
         return thread
 
     def _let_in(self, sock: Socket) -> ServerConnection | None:
-        """Return the caller's connection; None if it may not connect, or there is no room."""
+        """Return the caller's connection; None if the caller may not connect or there is no room."""
         who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
@@ -217,10 +217,10 @@ class LocalServer(TransportServer):
         return connection
 
     def _make_room(self, who: Credentials) -> str:
-        """Make room for a new connection; return why there is none, or an empty string.
+        """Make room for a new connection; return why this is impossible, or an empty string.
 
-        If all places are taken, the oldest connection that has not identified itself gives way, so that such
-        connections can't keep others out, however many there are.
+        If all places are taken, the oldest connection that has not identified itself gives way, so that any number of
+        such connections can't keep others out.
         """
         with self._lock:
             present = [connection for connection in self._connections if not connection.ending]
@@ -238,7 +238,7 @@ class LocalServer(TransportServer):
             oldest.hang_up(f"it sent no Hello, so its place at {self.address} went to a newer connection")
             return ""
 
-    # --- the receiving threads ---
+    # --- on the receiving threads ---
 
     def _serve(self, handler: ServerHandler, connection: ServerConnection) -> None:
         """Receive from one application until its connection ends."""
@@ -252,7 +252,7 @@ class LocalServer(TransportServer):
         self._receivers.discard(threading.get_ident())
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
-        """Pass packets on; return why the connection ended. Re-raises the handler's errors."""
+        """Pass packets on until the connection ends; return why it ended. Re-raises the handler's errors."""
         receive, poll, lock, backlog = connection.receive, connection.poll, self._lock, connection.backlog
         while True:
             try:
@@ -264,11 +264,11 @@ class LocalServer(TransportServer):
             except OSError as error:
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
-                continue  # handled at once, because a command behind it must not have to wait for it
+                continue  # handled immediately, because a command behind it must not have to wait for it
             lock.acquire(is_command(packet))
             try:
                 more = connection.pilot and poll(0)
-                if more:  # the packet had to wait, so packets that have arrived since may supersede it
+                if more:  # the packet had to wait, so packets that have arrived in the meantime may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
@@ -284,14 +284,14 @@ class LocalServer(TransportServer):
                 return reason
 
     def _next(self, connection: ServerConnection) -> bytes:
-        """Read all waiting packets, and return the one to handle first. The caller holds the lock."""
+        """Read all waiting packets, and return the packet to handle first. The caller holds the lock."""
         self._superseded += connection.take_in()
         return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
-        """Handle one packet; return why it ends the connection, or an empty string. The caller holds the lock."""
+        """Handle one packet. Return why it ends the connection, or an empty string. The caller holds the lock."""
         if not packet or connection.ending:
-            # An empty packet can't be distinguished from the end of the connection, so it is treated as such.
+            # An empty packet can't be distinguished from the end of the connection, so it is treated as the end.
             return f"the application is gone ({connection.peer.address})"
         if len(packet) > MAX_PACKET:
             return f"it sent a packet of more than {MAX_PACKET} bytes"
@@ -302,7 +302,7 @@ class LocalServer(TransportServer):
         return ""
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
-        """Handle a connection's first packet. A process that only wants to know who is listening sends none."""
+        """Handle a connection's first packet. A process that only checks who is listening sends no packet."""
         if packet != packets.hello():
             connection.hang_up(f"its Hello is not of revision {packets.REVISION} of the local transport")
             return
@@ -312,7 +312,7 @@ class LocalServer(TransportServer):
         handler.peer_joined(connection.peer)
 
     def _control(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> bool:
-        """Handle one of the transport's own packets; return False for garbage, which the handler gets."""
+        """Handle one of the transport's own packets. Return False for garbage, which is then passed to the handler."""
         try:
             message = packets.parse(packet)
         except DecodeError:
@@ -369,7 +369,7 @@ class LocalServer(TransportServer):
 
 
 def _problem(topic: str, subscribed: int) -> str:
-    """Return why an application with that many topics can't subscribe to another existing one; empty if it can."""
+    """Return why an application with that many topics can't subscribe to another existing topic; empty if it can."""
     if topic.startswith(_VIDEO) and "?" in topic:
         return f"{topic[:64]!r}: frames are not converted on one host; subscribe to {topic.partition('?')[0][:64]!r}"
     return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""
