@@ -17,8 +17,11 @@ from skyloop.errors import FileFormatError, UnknownNameError
 from skyloop.messages.frame import H264
 from skyloop.recording import layout, scan
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, End, FrameRecord, Start, Topic
+from skyloop.recording.listing import Described, describe, shown_name
 from skyloop.recording.pictures import Groups, Picture, compressed
 from skyloop.recording.scan import Message, Piece, Scan
+
+__all__ = ["Described", "Entry", "Item", "Recording", "Series", "describe", "shown_name"]
 
 #: Called with the fraction of a file read so far, 0 to 1.
 Progress = Callable[[float], object]
