@@ -49,8 +49,8 @@ def test_a_child_ends_when_its_input_does_and_its_last_words_stay_known() -> Non
         child.close()
         assert child.ending == "ended with exit code 1"
         assert child.quoted_output.startswith("; its output:\nxxx")
-        assert child.last_words.endswith("no vehicle")
-        assert len(child.last_words) <= 2000
+        assert child.stderr_tail.endswith("no vehicle")
+        assert len(child.stderr_tail) <= 2000
 
 
 @pytest.mark.process

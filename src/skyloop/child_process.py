@@ -74,12 +74,12 @@ class ChildProcess:
     ) -> None:
         """Start the child.
 
-        ``keep_errors``: whether to keep the child's standard error for :attr:`last_words`; if False, it goes to the
+        ``keep_errors``: whether to keep the child's standard error for :attr:`stderr_tail`; if False, it goes to the
         parent's standard error. ``inherited``: file descriptors that the child inherits. ``handed``: data for
         :func:`handed_over` that must not be on a command line, which all users can read.
         """
         self._errors: IO[bytes] | None = tempfile.TemporaryFile() if keep_errors else None  # noqa: SIM115
-        self._last_words = ""
+        self._stderr_tail = ""
         try:
             self._process = subprocess.Popen(
                 command,
@@ -111,10 +111,10 @@ class ChildProcess:
         return self._process.poll()
 
     @property
-    def last_words(self) -> str:
+    def stderr_tail(self) -> str:
         """Return the end of the child's standard error."""
         if self._errors is None or self._errors.closed:
-            return self._last_words
+            return self._stderr_tail
         number = self._errors.fileno()  # don't seek, because the child writes at the position of this file
         size = os.fstat(number).st_size
         return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
@@ -128,7 +128,7 @@ class ChildProcess:
     @property
     def quoted_output(self) -> str:
         """Return the end of the child's standard error, formatted to follow a message; empty if there is none."""
-        text = self.last_words
+        text = self.stderr_tail
         return f"; its output:\n{text}" if text else ""
 
     def part(self) -> None:
@@ -175,7 +175,7 @@ class ChildProcess:
     def close_errors(self) -> None:
         """Keep only the end of the child's standard error. Idempotent."""
         if self._errors is not None and not self._errors.closed:
-            self._last_words = self.last_words
+            self._stderr_tail = self.stderr_tail
             self._errors.close()
 
 

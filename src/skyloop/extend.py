@@ -70,7 +70,7 @@ class Commands(Protocol):
     @property
     def may_ask(self) -> bool: ...  #: whether a connection exists on which this application holds the authority
     @property
-    def told(self) -> Outcome | None: ...  #: the proxy's newest report about these intents
+    def newest_outcome(self) -> Outcome | None: ...  #: the proxy's newest report about these intents
 
     def outcome(self, intent: int) -> Outcome | None: ...  #: how the intent ended; None while it is in progress
     def release(self, *, wait: bool = True) -> None: ...  #: give up the authority; may raise NoAnswerError

@@ -321,7 +321,7 @@ def test_a_pilot_who_takes_over_a_landing_by_hand_keeps_it_whoever_had_the_vehic
 
 
 def _told(drone: Drone) -> int:
-    told = drone._commands.told
+    told = drone._commands.newest_outcome
     return 0 if told is None else told.intent
 
 

@@ -157,7 +157,7 @@ class Teleop:
 
     def _why_not(self) -> str:
         """Return the reason why the newest set-point has no effect."""
-        link, told = self._drone.link, commands(self._drone).told
+        link, told = self._drone.link, commands(self._drone).newest_outcome
         if link.application not in (LinkState.UP, LinkState.DEGRADED):
             return f"the link is {link.application.value} ({link.reason})"
         if self._drone.authority.state != "held":

@@ -106,7 +106,7 @@ class CommandSender:
         self._present_until_ns: int | None = None
         self.barred = False  #: whether the flight is ending: only stops and the library's own commands are sent
         self._impossible: dict[type, str] = {}  # by type of action: why neither the vehicle nor the proxy supports it
-        self.told: Outcome | None = None  #: the proxy's newest report on this application's intents
+        self.newest_outcome: Outcome | None = None  #: the proxy's newest report on this application's intents
         self._first_set_point = 0  # number of the first intent in this series of set-points; 0: none
         self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
         self.sends = ChannelCounter()  #: counts commands sent, and those not handed to the transport as ``dropped``
@@ -201,7 +201,7 @@ class CommandSender:
             # After any other command, a new series of set-points begins, and an earlier refusal no longer applies.
             self._first_set_point = 0
             return sent
-        told = self.told
+        told = self.newest_outcome
         self._first_set_point = self._first_set_point or intent
         return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
 
@@ -361,7 +361,7 @@ class CommandSender:
         """Clear the set-point and the authority so that the next connection sends nothing old."""
         with self._lock:
             self.schedule.clear(Fate.LINK)
-            self.told = None
+            self.newest_outcome = None
             changed = self._authority.disconnected()
         if changed:
             self._notify()
@@ -373,7 +373,7 @@ class CommandSender:
             changed = self._authority.feedback(sample, now_ns)
             self.schedule.observe(sample, now_ns, self.app_id)
             if sample.outcome is not None and sample.outcome.app_id == self.app_id:
-                self.told = sample.outcome
+                self.newest_outcome = sample.outcome
         if changed:
             self._moved(before, now_ns)
 

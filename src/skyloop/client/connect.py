@@ -289,7 +289,7 @@ class PrivateProxy:
         child = self._process
         if child.code is None:
             return
-        if child.code == _USAGE_ERROR and (words := child.last_words.removeprefix("skyloop: ")):
+        if child.code == _USAGE_ERROR and (words := child.stderr_tail.removeprefix("skyloop: ")):
             raise UsageError(words)
         raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 

@@ -319,7 +319,7 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
-        told = self._commands.told
+        told = self._commands.newest_outcome
         if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
             self._note(told.text)  # the text is cleared once the repeated request is executed
             if not told.over:  # it was executed; any other holder took the vehicle afterwards
@@ -376,7 +376,7 @@ class ActionWait:
             return True
         # A hover or idle command cancels a take-off without visible effect: if the vehicle is still on the ground, the
         # take-off is over.
-        stayed, told = commands.latest(Hover, Idle), commands.told
+        stayed, told = commands.latest(Hover, Idle), commands.newest_outcome
         stands = newest is not None and newest.state is FlightState.LANDED
         return stands and self._intent < stayed and told is not None and told.intent >= stayed
 

@@ -73,7 +73,7 @@ class CockpitProcess:
         code = self._process.wait(0.5)
         if code is None:
             return "no answer in time"
-        return self._process.last_words.rpartition("\n")[2] or f"it ended with exit code {code}"
+        return self._process.stderr_tail.rpartition("\n")[2] or f"it ended with exit code {code}"
 
     def __enter__(self) -> Self:
         return self

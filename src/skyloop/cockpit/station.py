@@ -108,7 +108,7 @@ class PilotConnection(Drone):
 
     def refusal(self, first: int) -> Outcome | None:
         """The outcome of a refused or ended command with at least this number, unless :meth:`has_ended` covers it."""
-        told = commands(self).told
+        told = commands(self).newest_outcome
         if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
             return None
         return told

@@ -307,7 +307,7 @@ class ChildSource:
         self._received_s = 0.0
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._last_words = ""  # end of the last child's standard error output
+        self._stderr_tail = ""  # end of the last child's standard error output
         settings = msgspec.json.encode(system.configuration).decode()
         self._runner = RestartingChild(
             [*command, system.kind, settings],
@@ -328,9 +328,9 @@ class ChildSource:
         """Start the child process and wait for its first frame."""
         self._runner.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
-            failed, last_words = self._failed, self._last_words
+            failed, stderr_tail = self._failed, self._stderr_tail
             self.close()
-            raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{last_words}")
+            raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{stderr_tail}")
 
     def close(self) -> None:
         """Terminate the child process. Idempotent."""
@@ -356,12 +356,12 @@ class ChildSource:
             child.kill()
 
     def _child_ended(self, child: ChildProcess | None, ending: str) -> float | None:
-        words = ending if child is None else child.last_words
-        self._last_words = f": {words}" if words else ""
+        words = ending if child is None else child.stderr_tail
+        self._stderr_tail = f": {words}" if words else ""
         if child is not None and child.code == MISSING:
             self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=words)
             self._first.set()
             return None
         if not self._runner.stopping:
-            self._trouble(f"no data from {self._system.address}{self._last_words}; trying again")
+            self._trouble(f"no data from {self._system.address}{self._stderr_tail}; trying again")
         return AGAIN_S

@@ -151,7 +151,7 @@ class Program:
             else:
                 in_vain = 0
                 if not self._ending.is_set():
-                    self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_last_words(folder)}"))
+                    self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_stderr_tail(folder)}"))
             soon = time.monotonic() - begun_s < SOON_S
             self._ending.wait(pause_s)
             pause_s = min(2 * pause_s, LONGEST_RESTART_S) if soon else self._restart_s
@@ -216,7 +216,7 @@ def _ending(code: int | None) -> str:
     return f"ended with exit code {code}"
 
 
-def _last_words(folder: Path) -> str:
+def _stderr_tail(folder: Path) -> str:
     try:
         with (folder / LOG).open("rb") as log:
             log.seek(max(0, log.seek(0, os.SEEK_END) - _LAST_BYTES))
