@@ -186,7 +186,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     sent_ns: int  #: sending time on the proxy's clock; unbounded, because an emergency stop is always valid
     action: AnyAction
     automatic: bool = (
-        False  #: whether the library itself requests it; then it never takes a vehicle from others
+        False  #: whether the library itself requests it; then it never takes a vehicle that someone else is flying
     )
 
 
