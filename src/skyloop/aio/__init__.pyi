@@ -919,7 +919,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones flown by other applications are left alone; to take one of them back, call ``drones[name].hover()``.
+        Drones flown by others are left alone; to take one of them back, call ``drones[name].hover()``.
         """
     async def idle(self) -> dict[str, bool]:
         """Keep the authority without changing what the vehicles do.
@@ -967,7 +967,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that are set aside are skipped. A hover doesn't take a drone from another application (see
+        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see
         :meth:`hover`). :attr:`spread` is the time between the first and the last command.
 
         Args:
@@ -1087,7 +1087,7 @@ def connect(
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the ``with`` block: ``"land"`` or ``"hover"``. A vehicle
-            flown by another application is left alone, and the log warns about it.
+            flown by someone else is left alone, and the log warns about it.
         authority: How a pilot requests the authority: its priority, how long it waits, and whether it asks the holder
             first. None: ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False searches only this host. None: the value of

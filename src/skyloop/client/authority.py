@@ -73,7 +73,7 @@ class AuthorityStatus:
     priority: int = DEFAULT_PRIORITY  #: priority of the last request, 0 (highest) to 31
     holder: str | None = None  #: name of the application that holds it; None: none, or unknown
     position: int = 0  #: position in the queue, 1 being next; 0 if unknown
-    expected_wait_s: float | None = None  #: waiting time if all requests ahead end at their announced times [s]
+    expected_wait_s: float | None = None  #: wait if all requests ahead end at their announced times [s]; None: unknown
     until_ns: int | None = None  #: end of the requested time, on the proxy's clock; None: unlimited
 
 

@@ -104,7 +104,7 @@ class CommandSender:
         self._ask_now = False
         self._refusal: Refused | None = None
         self._present_until_ns: int | None = None
-        self.barred = False  #: whether the flight is ending: only stops and the library's own commands are sent
+        self.barred = False  #: whether the flight is ending: only emergency stops and the library's commands are sent
         self._impossible: dict[type, str] = {}  # by type of action: why neither the vehicle nor the proxy supports it
         self.newest_outcome: Outcome | None = None  #: the proxy's newest report on this application's intents
         self._first_set_point = 0  # number of the first intent in this series of set-points; 0: none
@@ -386,7 +386,7 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def tick(self, now_ns: int) -> int:
-        """Send everything that is due; return when to call this next, on this process's clock [ns]."""
+        """Send everything that is due; return the latest time of the next call, on this process's clock [ns]."""
         last_request, stalled, unshown, due_ns = None, False, False, now_ns + _LATER_NS
         with self._lock:
             authority, schedule, present = self._authority, self.schedule, self.is_present(now_ns)

@@ -141,7 +141,7 @@ def connect(
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the ``with`` block: ``"land"`` or ``"hover"``. A vehicle
-            flown by another application is left alone, and the log warns about it.
+            flown by someone else is left alone, and the log warns about it.
         authority: How a pilot requests the authority: its priority, how long it waits, and whether it asks the holder
             first. None: ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False searches only this host. None: the value of

@@ -146,7 +146,7 @@ class Drone:
 
     It is a context manager, and every method is thread-safe. At the end of its ``with`` block, a drone that is flying
     under this application's authority lands, and the authority is released. Once the end has begun, commands from other
-    threads raise :class:`ClosedError`, except for an emergency stop. A drone that another application is flying is left
+    threads raise :class:`ClosedError`, except for an emergency stop. A drone that someone else is flying is left
     alone, and a drone that is returning because of a low battery continues to return. ``sys.exit()`` in a callback ends
     the flight in the same way. Pressing Ctrl-C (or a notebook's *Stop*) while a call waits makes the vehicle hover;
     during :meth:`land`, the landing continues. With ``wait=False``, calls don't wait and can't be interrupted. A lost
@@ -157,7 +157,7 @@ class Drone:
     :meth:`takeoff` and :meth:`land` return True if the command was handed to the transport. They return False while the
     link is down or the authority has not been granted yet. The command is then sent once both are available, unless it
     is more than 0.5 s old by that time. Set-points (velocity, attitude, position) also return False while the proxy is
-    known to refuse them, for example on the ground or while another application flies the vehicle. Events give the
+    known to refuse them, for example on the ground or while someone else flies the vehicle. Events give the
     reason. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,

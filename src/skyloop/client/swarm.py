@@ -273,7 +273,7 @@ class Swarm:
     def hover(self) -> dict[str, bool]:
         """Make all active drones stop and hold position.
 
-        Drones flown by other applications are left alone; to take one of them back, call ``drones[name].hover()``.
+        Drones flown by others are left alone; to take one of them back, call ``drones[name].hover()``.
         """
         return self.send(dict.fromkeys(self.active, Hover()))
 
@@ -401,7 +401,7 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of its drone, and send all of them at the same time.
 
-        Drones that are set aside are skipped. A hover doesn't take a drone from another application (see
+        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see
         :meth:`hover`). :attr:`spread` is the time between the first and the last command.
 
         Args:

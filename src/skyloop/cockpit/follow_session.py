@@ -351,7 +351,7 @@ def _settings(distance_m: float | None) -> ChaseSettings:
 
 
 def _check_in_air(pilot: PilotConnection) -> Feedback:
-    """Return the newest feedback after checking that the vehicle is in the air and not flown by another application."""
+    """Return the newest feedback after checking that the vehicle is in the air and not flown by someone else."""
     feedback = pilot.feedback(max_age_s=OLD_FEEDBACK_S)
     if feedback.others:
         raise RefusedError(f"{feedback.others}: hover first to take it over")

@@ -107,7 +107,7 @@ def add_mark(path: Path, at_s: float, text: str) -> Notes:
 
 
 def remove_mark(path: Path, mark: Mark) -> Notes:
-    """Remove a mark from a recording. Raise ``UnknownNameError`` if the recording has no such mark."""
+    """Remove a mark. Raise ``UsageError`` if its text is too long, ``UnknownNameError`` if there is no such mark."""
     check_mark(mark.text)
     notes = read_notes(path)
     if mark not in notes.marks:

@@ -326,7 +326,7 @@ class ChaseLaw:
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
         """Return the angle [rad] by which to look to the left of the target's expected position, and its rate.
 
-        While hovering, the vehicle looks to both sides, first and furthest in the target's last direction of motion.
+        While hovering, look to both sides, first and furthest the way the target last moved; 0 in other phases.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -522,7 +522,7 @@ class ChaseLaw:
 
 
 def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
-    """Return the distance [m] and time [s] of the closest approach, and the unit vector towards the passing side.
+    """Return the distance [m] and time [s] of the closest approach, and the unit vector (2,) towards the passing side.
 
     ``here`` is the vehicle's position relative to the other object, and ``moving`` its relative velocity.
     """

@@ -89,7 +89,7 @@ class CourseLaw(VelocityLaw):
         start: Point = (0.0, 0.0),
         settings: CourseSettings | None = None,
     ) -> None:
-        """Initialise the control law; ``start`` is the vehicle's position on the map at the first feedback."""
+        """Initialise the law; ``start`` is the map position at the first feedback. The map shares its yaw."""
         self.settings = s = settings or CourseSettings()
         super().__init__(
             SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),

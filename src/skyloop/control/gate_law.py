@@ -182,7 +182,7 @@ class GateLaw(VelocityLaw):
         return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
 
     def _approach(self, axis: Axis) -> float:
-        """Return the speed along the axis while aligning [m/s]: zero outside the cone, negative if too close."""
+        """Return the speed along the axis while aligning [m/s]: 0 well outside the cone, negative if too close."""
         s = self.settings
         left_m = -s.stand_m - axis.along_m
         if left_m < 0.0:

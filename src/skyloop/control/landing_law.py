@@ -89,7 +89,7 @@ class LandingSettings:
     #: Marker speed above which the image's longer side is aligned with its motion, to keep it in view for longer.
     turn_from_m_s: float = 0.8
     turn_rad_s: float = 0.8
-    long_side_rad: float = math.pi / 2  #: counter-clockwise angle from forward to the image's longer side
+    long_side_rad: float = math.pi / 2  #: angle of the image's longer side from forward, counter-clockwise from above
 
     fresh_s: float = 0.35  #: time to continue without a sighting
     recovering_s: float = 4.0  #: time to follow the predicted position of an unseen marker before searching

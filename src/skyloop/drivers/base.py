@@ -173,7 +173,7 @@ class ExternalPose:
     """
 
     position_m: Vector  #: position of the body's origin in world axes, x east, y north, z up [m]
-    quaternion: tuple[float, float, float, float]  #: rotation (x, y, z, w) from body axes to world axes
+    quaternion: tuple[float, float, float, float]  #: rotation (x, y, z, w) from body (forward, left, up) to world axes
     captured_ns: int  #: time of the measurement, on this host's monotonic clock
     position_std_m: float | None = None  #: standard deviation of the position [m], 0 or more; None if unknown
     attitude_std_rad: float | None = None  #: standard deviation of the orientation [rad], 0 or more; None if unknown
@@ -204,7 +204,7 @@ class Driver(ABC):
         uri: Address of the vehicle, including its options.
 
     Attributes:
-        shared: Whether someone else may also fly the vehicle. If so, a vehicle found in the air is considered theirs.
+        shared: Whether others may also fly the vehicle. If so, a vehicle found in the air is theirs and is left alone.
         parameters_without_authority: Names of parameters that any pilot may write because they don't affect a flight.
         serve_link: Set by a host before :meth:`open` if one of its threads serves several vehicles; None: the driver
             uses its own thread.
@@ -374,7 +374,7 @@ class Driver(ABC):
     def checkup(self) -> list[Diagnostic]:
         """Return findings about the vehicle and its settings that need attention before a flight.
 
-        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` display them. Called on any thread; returns immediately.
+        For ``skyloop doctor`` and ``drone.preflight()``. Called while the driver is open, on any thread; must not wait.
         """
         return []
 

@@ -21,7 +21,7 @@ from skyloop.drivers.base import Sink
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
 
-REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time before a reason is reported again while nothing is received
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
 _BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # error numbers if another program has locked the port
 _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of port names below /dev
 _MAX_LISTED_PORTS: Final = 4  # maximum number of ports that a message lists

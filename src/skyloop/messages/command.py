@@ -183,10 +183,10 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     seq: Count  #: increases with every packet sent on a connection
     lease: Count  #: number of the sender's lease; 0 if there is none (emergency stop only)
     intent: Count  #: increases with each request by the *application*; the library's repeats don't change it
-    sent_ns: int  #: sending time on the proxy's clock; not checked, because an emergency stop is always valid
+    sent_ns: int  #: sending time on the proxy's clock; unbounded, because an emergency stop is always valid
     action: AnyAction
     automatic: bool = (
-        False  #: whether the library itself requests it; then it never takes a vehicle from other applications
+        False  #: whether the library itself requests it; then it never takes a vehicle that someone else is flying
     )
 
 
@@ -267,7 +267,7 @@ class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
 
     captured_ns: TimeNs  #: time of the measurement, on the proxy's clock
     position_m: tuple[float, float, float]  #: position of the body's origin [m]
-    quaternion: tuple[float, float, float, float]  #: x, y, z, w of the rotation from body axes to world axes
+    quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
     position_std_m: float | None = None  #: standard deviation of the position [m], if known
     attitude_std_rad: float | None = None  #: standard deviation of the attitude [rad], if known
 

@@ -231,7 +231,7 @@ class Proxy:
         unless_flying: bool = False,
         hangs: bool = False,
     ) -> bool:
-        """End the flight, then the proxy, and release all resources. Idempotent. Must not be called by the driver.
+        """End the flight, then the proxy, and release all resources. Idempotent. Not on the driver's own threads.
 
         First, everything except landings and emergency stops is refused permanently, whether or not the vehicle is
         flying. A flying vehicle is then landed within ``within_s`` [s]; 0: don't land. If it does not land in time, it

@@ -39,7 +39,7 @@ from skyloop.proxy.requests import Session
 from skyloop.proxy.topics import camera_problem
 from skyloop.transport.base import ANNOTATIONS, LOGS, RESULTS, TransportServer, results
 
-MAX_ANNOTATION: Final = 32_768  #: number of bytes in an annotation's packet
+MAX_ANNOTATION: Final = 32_768  #: maximum number of bytes in an annotation's packet
 #: A worker that is silent for this long loses its share, because the worker or its host hangs.
 SILENT_S: Final = 1.0
 #: How far in the future the capture time of a result's frame may be, because of errors in its camera's clock.

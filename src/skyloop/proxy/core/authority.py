@@ -118,7 +118,7 @@ class Authority:
     """Tracks who holds the authority over one vehicle, and who waits for it. Methods return changes in order."""
 
     def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
-        self.timeout_ns = nanoseconds(timeout_s)  #: after this time without packets, a holder loses the lease
+        self.timeout_ns = nanoseconds(timeout_s)  #: after this time without a valid command, a holder loses the lease
         self.ask_ns = nanoseconds(ask_s)  #: time for a holder to answer before the higher priority wins
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 if there is none
@@ -246,7 +246,7 @@ class Authority:
                 self.silent = holder
             return effects
         effects = self._settle(now_ns)
-        if self._is_over(now_ns) and not self._expiry_reported:  # otherwise the next in the queue would have taken over
+        if self._is_over(now_ns) and not self._expiry_reported:  # nobody waits, or the lease would have ended
             self._expiry_reported = True
             effects.append(Expired(holder.app_id, self.lease))
         return effects
@@ -297,7 +297,7 @@ class Authority:
     def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
         """Give the authority to the first application in the queue. The former holder then waits.
 
-        The old holder keeps its time, but gets at most the new one's priority. Otherwise it would win again at once.
+        The old holder keeps its remaining time, but gets at most the new one's priority, or it would win again at once.
         """
         holder, lease = self.holder, self.lease
         assert holder is not None

@@ -163,7 +163,7 @@ class FailsafeLadder:
             effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
         elif self.returning and inputs.return_problem:
             effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
-        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers land only while asked to
+        unheard = isinstance(self._wanted, Land) and not inputs.shown  # drivers keep it only while it is repeated
         return effects + self._try(now_ns, FlightState.UNKNOWN if unheard else inputs.state)
 
     def fresh_command(self) -> list[Effect]:
@@ -201,7 +201,7 @@ class FailsafeLadder:
 
     @property
     def lands(self) -> bool:
-        """Whether the intent makes the vehicle land, here or at its start, no matter who requested the landing."""
+        """Whether the task makes the vehicle land, here or at its start, no matter who requested the landing."""
         return isinstance(self._wanted, Land | ReturnToStart)
 
     def continue_landing(self, now_ns: int) -> None:

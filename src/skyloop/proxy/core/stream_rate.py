@@ -19,7 +19,7 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 
 LEAST_KBIT_S: Final = 60
-#: The initial rate. Isolated late frames do not reduce the rate further: the path is idle for most of the wait, so a
+#: The initial rate. Isolated late frames do not reduce the rate below it: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
 STANDING_S: Final = 0.25  #: the shortest wait within this time is the wait in the standing queue

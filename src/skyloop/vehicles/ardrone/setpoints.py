@@ -2,7 +2,7 @@
 
 ``REF`` has bits for take-off, landing and emergency, which must be repeated until navdata reports the new state. The
 emergency bit toggles the emergency each time it changes from clear to set. Because packets get lost, a request keeps
-the bit set until navdata confirms the change. The bit is toggled again only if later navdata still shows no effect,
+the bit set until navdata confirms it. The bit is toggled again only if navdata made later by the drone shows no effect,
 because an extra toggle would undo the first. ``PCMD`` has roll (positive to the right), pitch (negative nose down),
 climb (positive up) and yaw rate (positive clockwise), each from -1 to 1 as a fraction of the limit set in the drone.
 """
@@ -106,7 +106,7 @@ def _share(value: float, limit: float) -> float:
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still on the ground is refusing to take off
 RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after sending a take-off is ours, not another program's
-#: Navdata reports the effect of the emergency bit within this time, measured by the drone's clock or by ours.
+#: Navdata reports the effect of the emergency bit within this time, both by the drone's clock and by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
 
 

@@ -138,7 +138,7 @@ class SetpointController:
         if isinstance(action, Takeoff):
             self._take_off(vehicle, now_ns, new=new)
         elif isinstance(action, Land):
-            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # foreign modes are respected
+            if not (self.goal is Goal.LAND and self._entered and (alone or not new)):  # repeats respect foreign modes
                 self._land(vehicle)
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
