@@ -393,7 +393,7 @@ class Swarm:
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
-        running: set[asyncio.Task[Any]] = set()  # changed on this event loop only: a thread once came too late
+        running: set[asyncio.Task[Any]] = set()  # changed on this event loop only, so that none is missed
         over = False
 
         async def call(drone: Drone) -> T:
