@@ -945,7 +945,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest frames it has not seen; at most ``depth`` frames wait.
+            function: Called in its own thread with the newest frames it has not seen; up to ``depth`` frames wait.
             camera: Name of the camera; None: the vehicle's first camera, whichever it is after a restart.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Whether to call it on the receiving thread instead, with every frame. It must be quick and not wait.
@@ -1131,7 +1131,7 @@ class Drone:
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
-            UsageError: If ``function`` can't be called or another argument is out of range.
+            UsageError: If ``function`` is not callable or another argument is out of range.
             ClosedError: If the drone was closed.
         """
         if depth is not None and depth < 1:
