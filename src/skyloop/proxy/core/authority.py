@@ -210,8 +210,8 @@ class Authority:
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
         """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or if ``by_id`` has not asked.
 
-        If the holder agrees, the authority passes to the first in the queue. The former holder then waits with at most
-        its own priority. A refusal is reported. A strictly higher priority still wins once the time to answer is up.
+        If the holder agrees, the authority passes to the first in the queue. The former holder then waits, with no
+        higher priority. A refusal is reported. A strictly higher priority still wins once the time to answer is up.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
