@@ -632,7 +632,7 @@ class Drone:
             **how: As for :meth:`frames`.
 
         Raises:
-            UsageError: If ``function`` can't be called or an option is out of range.
+            UsageError: If ``function`` is not callable or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
@@ -665,7 +665,7 @@ class Drone:
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
-            UsageError: If ``function`` can't be called or an option is out of range.
+            UsageError: If ``function`` is not callable or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
@@ -683,7 +683,7 @@ class Drone:
                 strictly higher priority wins after the proxy's ``authority.ask_s``.
 
         Raises:
-            UsageError: If ``function`` can't be called.
+            UsageError: If ``function`` is not callable.
             ClosedError: If the drone was closed.
         """
     def on_overview(
