@@ -122,7 +122,7 @@ class FileFormatError(UsageError):
 
 
 class NameTakenError(UsageError):
-    """Raised when the requested name is already in use; the message tells what uses it."""
+    """Raised when the requested name is already in use; the message says what is using it."""
 
 
 class DecodeError(SkyloopError, ValueError):

@@ -61,7 +61,7 @@ _BURST_S: Final = 0.15
 _GROWS: Final = 3  # factor by which a variable rate may increase at most
 _FALLS: Final = 12  # below 1/12 of the maximum rate, a single image would occupy the link for too long
 _KEY_EVERY_S: Final = 10.0  #: maximum time between key frames; long, because late subscribers request a key frame
-#: Colours as in PAL television, with values from 16 (black) to 235 (white): FFmpeg produces and decoders expect them.
+#: Standard-definition television colours, from 16 (black) to 235 (white), which FFmpeg produces and decoders expect.
 _COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
 
 

@@ -625,14 +625,14 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest frames it has not seen; at most ``depth`` frames wait.
+            function: Called in its own thread with the newest frames it has not seen; up to ``depth`` frames wait.
             camera: Name of the camera; None: the vehicle's first camera, whichever it is after a restart.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Whether to call it on the receiving thread instead, with every frame. It must be quick and not wait.
             **how: As for :meth:`frames`.
 
         Raises:
-            UsageError: If ``function`` can't be called or an option is out of range.
+            UsageError: If ``function`` is not callable or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
@@ -665,7 +665,7 @@ class Drone:
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
-            UsageError: If ``function`` can't be called or an option is out of range.
+            UsageError: If ``function`` is not callable or an option is out of range.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
@@ -683,7 +683,7 @@ class Drone:
                 strictly higher priority wins after the proxy's ``authority.ask_s``.
 
         Raises:
-            UsageError: If ``function`` can't be called.
+            UsageError: If ``function`` is not callable.
             ClosedError: If the drone was closed.
         """
     def on_overview(
@@ -777,7 +777,7 @@ class Drone:
             inline: Call it on the receiving thread instead. It must be quick and must not wait.
 
         Raises:
-            UsageError: If ``function`` can't be called or another argument is out of range.
+            UsageError: If ``function`` is not callable or another argument is out of range.
             ClosedError: If the drone was closed.
         """
 

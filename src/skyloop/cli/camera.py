@@ -268,7 +268,7 @@ def _from_video(cv: Any, name: str) -> Iterator[Picture]:
 
 
 class _Vehicle:
-    """A vehicle's camera that is used for a limited time; a context manager."""
+    """Context manager that uses a vehicle's camera for a limited time."""
 
     def __init__(self, source: str, camera: str | None, seconds: float) -> None:
         from skyloop.client import connect

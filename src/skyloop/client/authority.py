@@ -295,7 +295,7 @@ def answering(
     """Return an event callback that calls ``function`` when another application requests this one's authority.
 
     ``answer`` is called with the lease, the requesting application's number, the decision and the reason. Raises
-    :class:`UsageError` if ``function`` can't be called.
+    :class:`UsageError` if ``function`` is not callable.
     """
     if not callable(function):
         raise UsageError(f"{function!r:.80} can't be called: expected a function with one argument")

@@ -67,7 +67,7 @@ class ProxyConnection:
 
     @property
     def connected(self) -> bool:
-        """Whether, as far as is known, a proxy is connected and has answered Hello."""
+        """Whether a proxy is connected and has answered Hello, as far as is known."""
         session = self.session
         return session is not None and session.open
 

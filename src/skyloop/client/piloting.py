@@ -133,7 +133,7 @@ class Piloting:
     def let_go(self, reason: str, *, land: bool = False) -> bool:
         """Hover or land by the library's own decision; no other method does this.
 
-        Because no person made this decision, the vehicle is left alone if others are flying it, if it is
+        Because the library decides this, not a person, the vehicle is left alone if others are flying it, if it is
         landing or returning, or if this application has landed or stopped it. The proxy applies the same rule. A
         take-off without visible effect is cancelled. With ``land``, it lands instead of hovering. Returns whether
         anything was sent.

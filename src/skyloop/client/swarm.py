@@ -156,7 +156,7 @@ class Swarm:
     *active* drones. If it fails for some drones, the others still get it, and ``on_error`` decides what happens next:
 
     - ``"continue"``: failed drones hover and are set aside, the others continue. :attr:`errors` lists those set aside;
-      a drone taken over by another application returns when its authority is given back, the others return with
+      a drone taken over by another application rejoins once its authority is given back, the others through
       :meth:`readmit`. :class:`SwarmError` is raised when none is left, and at the end of the block.
     - ``"raise"``: :class:`SwarmError` is raised, the others keep their commands.
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.

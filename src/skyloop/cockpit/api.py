@@ -311,7 +311,7 @@ class RoutesApi:
 
     @answered
     async def check(self, request: Request) -> Response:
-        """Respond with the problems of a route for a drone, and the ``id`` used to fly that route."""
+        """Respond with any problems that a drone's route has, and the ``id`` used to fly that route."""
         station = self._fleet.station(request.path_params["name"])
         route = parse_route(bytes(await body_of(request, msgspec.Raw)))
         async with self._checking:

@@ -89,7 +89,7 @@ class PlaceFlight:
         return self._job is not None
 
     def watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
-        """Monitor a flight that was commanded."""
+        """Monitor a commanded flight."""
         self.cancel()
         self._station.goals[self._app] = leg.goal
         self._job = asyncio.create_task(self._watch(command, pilot, leg))

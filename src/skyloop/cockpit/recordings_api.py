@@ -123,7 +123,7 @@ class RecordingsApi:
 
     @answered
     async def report(self, request: Request) -> Response:
-        """Respond with the report on a recording, as a page."""
+        """Respond with the report on a recording, as an HTML page."""
         path = await self._recordings.path(request.path_params["name"])
         page = await while_wanted(request, self._recordings.reports.make(path, request.query_params.get("drone")))
         return HTMLResponse(page, headers={"content-security-policy": _REPORT_POLICY})

@@ -27,7 +27,7 @@ Json = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TakeoverQuestion:
-    """A question from another application that wants the authority this page holds."""
+    """Another application's request for the authority that this page holds."""
 
     query: TakeoverQuery
     until_ns: int  #: time at which the question expires, on the proxy's clock

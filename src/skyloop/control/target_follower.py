@@ -288,10 +288,10 @@ class TargetFollower(AirframeLaw):
 class FollowTarget(Behaviour):
     """Keeps a target in view at a distance, circles it or only turns towards it. The vehicle must be airborne.
 
-    The target is the object in a box in the first frame, or the largest object of a class. It is tracked by appearance
-    and, if there is a detector, by detections, and is distinguished from look-alikes. While the target is hidden, the
-    vehicle first follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour ends
-    in a hover. Neither a position nor a map is needed. Vehicles that report no velocity are flown by attitude.
+    The target is the object inside a given box in the first frame, or the largest one of a class. It is tracked by
+    appearance and, if there is a detector, by detections, and is distinguished from look-alikes. While it is hidden,
+    the vehicle first follows its predicted motion, then hovers, then looks around. After ``give_up_s`` the behaviour
+    ends in a hover. Neither a position nor a map is needed. Vehicles that report no velocity are flown by attitude.
 
     Attributes:
         follower: The object that finds the target and computes the set-points.

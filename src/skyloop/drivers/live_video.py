@@ -420,8 +420,8 @@ class StreamRelay:
         """Forward an undamaged frame if it is wanted and decodable after the last one; return whether it was forwarded.
 
         ``captured_ns`` is the capture time of the decoded frame, too. ``number`` counts the frames received on the
-        connection; skipped frames appear as gaps. ``picture``: False if the unit has only parameters, which are not
-        forwarded.
+        connection; skipped frames appear as gaps. ``picture``: False if the unit contains only parameter sets; these
+        are not forwarded.
         """
         if not self.wanted(camera):
             return False

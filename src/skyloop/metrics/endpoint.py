@@ -304,7 +304,7 @@ class _Server(ThreadingHTTPServer):
                 self._open[request] = time.monotonic() + ANSWER_S
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        # Limit the whole connection: with a limit for each read, a byte now and then could keep it open forever.
+        # Limit the connection's total time: a time limit per read would let a client that trickles bytes hold it open.
         guard = threading.Timer(self._deadline_s, _hang_up, (request,))
         guard.daemon = True
         guard.start()

@@ -26,8 +26,8 @@ from skyloop.transport.priority import PacketBacklog
 if TYPE_CHECKING:
     import zenoh
 
-#: Maximum number of one application's packets, and of its commands, that wait for the handler. Further packets are not
-#: acknowledged and are therefore resent. Further commands are dropped, as newer ones follow. Set-points count as one.
+#: Maximum number of packets, and of commands, from one application that may wait for the handler. Excess packets are
+#: not acknowledged, so they are resent. Excess commands are dropped, since newer ones follow. Set-points count as one.
 MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: interval between checks for packets to resend
 _OWN_AT_MOST: Final = 8  # queued packets of the transport itself; they may be lost, and are then requested again

@@ -213,7 +213,7 @@ def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, by
 
 # Attachments ---------------------------------------------------------------------------------------------------
 
-#: Attachment of a packet sent to one end: the packet's number, from 1. The transport's own packets all have number 0.
+#: Attachment of a packet sent to a single end: its number, counted from 1. The transport's own packets have number 0.
 number = _NUMBER.pack
 
 

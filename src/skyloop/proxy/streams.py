@@ -150,7 +150,7 @@ class StreamForm:
             self._changed.notify()
 
     def report(self, report: StreamReport, now_ns: int) -> None:
-        """Handle a subscriber's report, which gives its newest frame and whether it needs a key frame."""
+        """Handle a subscriber's report of the newest frame it received and of whether it needs a key frame."""
         with self._changed:
             self._wants_key = self._wants_key or report.wants_key
             # A number that this stream never sent would distort the measurement of the path.

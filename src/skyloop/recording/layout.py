@@ -105,7 +105,7 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
 
 class Start(msgspec.Struct, frozen=True):
-    """Metadata ``skyloop.recording``, written at the beginning of each file."""
+    """The ``skyloop.recording`` metadata, written at the start of each file."""
 
     layout: int
     skyloop: str  #: Skyloop's version

@@ -568,7 +568,7 @@ class _Drone:
 
 
 def entity_of(drone: str, camera: CameraInfo) -> str:
-    """Return a camera's entity; the entity is in the world if the camera's mounting is known."""
+    """Return a camera's entity, which is placed in the world if the camera's mounting is known."""
     return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
 
 

@@ -420,7 +420,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` determines everything in it that is random (the walks of its targets)."""
+    """A whole world. ``seed`` determines everything random in it (the walks of its targets)."""
 
     name: str
     room: Room

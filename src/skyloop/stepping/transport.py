@@ -125,7 +125,7 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect a client, whose handler runs on the executor's thread; LinkError if there is one, or after a stop."""
+        """Connect a client; its handler runs on the executor's thread. LinkError if there is one, or after a stop."""
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")

@@ -6,7 +6,7 @@ clients*). The transport knows packets and topics, but not their meaning. An imp
 
 - No call ever blocks on the other end. A packet that does not fit into the buffer at that moment is not sent, and the
   caller gets False.
-- A packet arrives whole or not at all. Packets of one connection keep their order. A packet has 1 to
+- A packet arrives whole or not at all. Packets on a connection stay in order. A packet has 1 to
   :data:`MAX_PACKET` bytes; sending any other raises :class:`skyloop.errors.UsageError`.
 - Handlers run on the transport's receiving threads, one call at a time per end, so they must return quickly. A handler
   that raises ends its own connection, not the transport.

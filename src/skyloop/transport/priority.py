@@ -64,7 +64,7 @@ class PacketBacklog:
 
     @property
     def lane(self) -> Lane | None:
-        """The lane of the leading commands; without any, that of the first packet; None if the backlog is empty."""
+        """Lane of the leading commands, or OTHERS if the first packet is no command; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:

@@ -162,7 +162,7 @@ class MarkerDetector:
     def why_nothing(self) -> str:
         """Explain why no marker was found.
 
-        As long as no image contains a marker, some images are also searched for markers of other dictionaries.
+        Until a marker is found, some images are also searched for markers from other dictionaries.
 
         Returns:
             An explanation; empty after only a few images, or if any image contained a marker.

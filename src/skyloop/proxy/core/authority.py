@@ -1,4 +1,4 @@
-"""The authority to command: numbered leases, priorities, and a queue of pilots who wait. Pure: the time is an argument.
+"""The authority to command: numbered leases, priorities, and a queue of waiting pilots. Pure: the time is an argument.
 
 Priority 0 is the highest, 31 the lowest. At any time, at most one application *holds* the authority. The holder has a
 lease, whose number is unique in this run. A strictly higher priority takes over at once or after the holder has been
@@ -210,8 +210,8 @@ class Authority:
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
         """Handle the holder's answer. Does nothing if ``app_id`` is not the holder, or if ``by_id`` has not asked.
 
-        If the holder agrees, the first in the queue gets the authority. The former holder then waits with at most the
-        same priority. A refusal is reported. A strictly higher priority still wins after the holder's time to answer.
+        If the holder agrees, the authority passes to the first in the queue. The former holder then waits, with no
+        higher priority. A refusal is reported. A strictly higher priority still wins once the time to answer is up.
         """
         holder = self.holder
         asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
@@ -308,7 +308,7 @@ class Authority:
         return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
 
     def _relieve(self) -> Lost:
-        """End the lease of a holder whose time is over, if others are waiting."""
+        """End the lease of a holder whose time is up, if others are waiting."""
         assert self.holder is not None
         lost = Lost(self.holder.app_id, self.lease, "expired")
         self._vacate()

@@ -57,7 +57,7 @@ CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arr
 AT_REST_M_S: Final = 0.3
 HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this …
 STALL_NS: Final = 10 * NS_PER_S  #: … within this time
-#: How long a failsafe waits for a problem that prevents a return to go away, before it lands the vehicle in place.
+#: If a return is not possible, how long a failsafe waits for that to change before it lands the vehicle in place.
 PATIENCE_NS: Final = NS_PER_S
 CLEARANCE_M: Final = 0.3  #: distance to keep from the ceiling of the room and the top of the safety box
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -224,8 +224,8 @@ class Autopilot:
             arrived = there or (altitude is None and rising_s >= needed_s)
         if not arrived and rising_s < LONGEST_RISE * needed_s + LONGEST_RISE_S:
             return Velocity(up=settings.climb)
-        # A stuck altimeter always reports the same altitude. If its readings change but stay near the ground until time
-        # is up, they are right: the motors turn without lifting it, as with a real Betaflight on a slow computer.
+        # A stuck altimeter always reports the same altitude. If the readings change but stay low until time is up, they
+        # are correct: the motors turn without lifting the vehicle, as with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
             self.mode = Mode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)

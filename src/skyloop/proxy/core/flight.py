@@ -277,9 +277,9 @@ class Flight:
     def has_ended(self, reported: FlightState, now_ns: int, feedback: Feedback | None) -> bool:
         """Return whether the steered task has ended on the ground, in which case the vehicle is no longer steered.
 
-        If the vehicle reports its state, that report decides. Otherwise, a descent has reached the ground when the
-        altimeter reads a low altitude and shows no progress. A landing with neither report nor altimeter continues for
-        :data:`BLIND_NS`, and its result is unknown. ``feedback``: as in :meth:`observe`.
+        If the vehicle reports its state, that report takes precedence. Otherwise, a descent has reached the ground when
+        the altimeter reads a low altitude and shows no progress. A landing with neither report nor altimeter continues
+        for :data:`BLIND_NS`, and its result is unknown. ``feedback``: as in :meth:`observe`.
         """
         landing = self._state is FlightState.LANDING
         if feedback is None:

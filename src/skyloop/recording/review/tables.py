@@ -231,7 +231,7 @@ def _cell(value: Any) -> Cell:
 # Files ----------------------------------------------------------------------------------------------------------
 
 
-#: Channels exported as tables; for frames, their times are listed.
+#: Channels exported as tables; a table of frames lists their times and sizes, not their images.
 TABLES: Final = tuple(Channel)
 _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r", "\n", "＝", "＋", "－", "＠")  #: characters that start a formula
 _NUMBER: Final = r"[-+]?(?:[0-9.]+(?:e[-+]?[0-9]+)?|inf|nan)"

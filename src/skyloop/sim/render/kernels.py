@@ -419,7 +419,7 @@ def draw(
                     dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)
                     green = np.int32(np.int32(green + np.int32(green >> 8)) & 0xFF00)
                     out[n] = np.int32(dark | green)
-        # Each number's fourth byte is the first byte of the next pixel, which is written later.
+        # Each number's fourth byte falls on the first byte of the next pixel, which then overwrites it.
         bytes_ = packed[begin : begin + count_]
         for n in range(len(bytes_)):
             bytes_[n] = colours[n]

@@ -41,7 +41,7 @@ class Quality(Enum):
 
 
 def use_one_core() -> None:
-    """Restrict OpenCV to the calling thread in this whole process.
+    """Restrict OpenCV to the calling thread, for the whole process.
 
     Images this small do not benefit from more threads, and OpenCV's worker threads would occupy cores that proxies and
     applications need. A process that only runs a simulation calls this once when it starts.

@@ -150,7 +150,7 @@ _LARGEST = 1280.0  # maximum number of texels along a side of a room's surface
 _AFAR_M = 150.0  # extent of the open ground
 _SKY_M = 400.0  # half the side of the sky
 SIDES = 6  #: quads per box; ``static_quads`` has the shell first, then boxes, panels, markers
-# Direction of the shadows of solids: away from the light in ``shading``, but short, as in a room lit from all sides.
+# Where solids cast their shadows: away from the light in ``shading``, but short, as in a room lit from all sides.
 _LEAN = np.array([-0.16, 0.20])
 
 

@@ -371,6 +371,6 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """Return a slot to the server, because the application's last array over it no longer exists."""
+        """Return a slot to the server, now that the application's last array backed by it is gone."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)

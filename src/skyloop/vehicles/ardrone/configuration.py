@@ -107,7 +107,7 @@ class Configurator:
     # Receiving ----------------------------------------------------------------------------------------------------
 
     def on_acknowledge(self, acknowledged: bool) -> bool:
-        """Handle the acknowledge bit of the newest navdata; return whether a command is due at once."""
+        """Handle the acknowledge bit of the latest navdata; return whether a command must be sent at once."""
         self._acknowledged = acknowledged
         if self._phase is _Phase.CLEARING and not acknowledged:
             self._begin_asking()

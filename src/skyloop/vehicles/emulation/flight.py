@@ -163,7 +163,7 @@ class FlightControl:
         self.move_body(forward, left, up, yaw_rate)
 
     def move_body(self, forward: float, left: float, up: float, yaw_rate: float) -> None:
-        """Fly a velocity in levelled body axes [m/s] with a yaw rate, positive counter-clockwise [rad/s]."""
+        """Fly at a velocity in levelled body axes [m/s] with a yaw rate, positive counter-clockwise [rad/s]."""
         self._fly(VelocityAction(forward, left, up, yaw_rate))
 
     def go(self, place: Vec3, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:

@@ -30,7 +30,7 @@ class VideoSettings(Protocol):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The main camera and, if another camera's image is inset into its own, that camera."""
+        """The main camera, followed by the camera whose image is inset into the main camera's image, if any."""
 
     @property
     def inset(self) -> tuple[int, int]:

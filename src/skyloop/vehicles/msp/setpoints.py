@@ -53,8 +53,8 @@ OTHER: Final = 0.15  #: fraction by which the learnt throttle may differ from th
 GROUND_NS: Final = {True: nanoseconds(0.6), False: nanoseconds(1.0)}  #: duration of a stall that counts as a touchdown
 HEADWAY: Final = 0.4  #: fraction of the requested rate below which a descent counts as stalled
 STILL: Final = {True: 0.1, False: 0.4}  #: vertical speed [m/s] above which the vehicle is airborne, by precision
-#: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces noise of
-#: 0.2 m/s (UWB), which never stayed below STILL for GROUND_NS, to 0.03 m/s, but a descent at 0.15 m/s remains visible.
+#: Time constant [s] of the filter for the climb and height used to detect lift-off and touch-down. It reduces UWB noise
+#: from 0.2 m/s (which never stayed below STILL for GROUND_NS) to 0.03 m/s, but a descent at 0.15 m/s still shows.
 SMOOTH_S: Final = 0.4
 SINK_PER_S: Final = 0.5  #: throttle reduction while the vehicle seems to be on the ground, fraction per second
 #: Fraction of the hover throttle below which a vehicle that seems motionless counts as landed, keyed by whether it is

@@ -1,7 +1,7 @@
 """Requests to the flight controller, its state in SI units and our axes, and its motion. Pure.
 
-After identifying the flight controller, we request its state as fast as it replies. The only velocity in MSP is the
-barometer's climb, so external poses are differentiated.
+After identifying the flight controller, we request its state as fast as it replies. Apart from GPS, the only
+velocity that MSP provides is the barometric climb rate, so external poses are differentiated.
 """
 
 from __future__ import annotations

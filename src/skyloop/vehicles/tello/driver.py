@@ -87,7 +87,7 @@ class TelloDriver(Driver):
         return self._apply(action, new=False)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return preflight findings based on the drone's newest state."""
+        """Return preflight findings based on the drone's latest state."""
         link = self._link
         if link is None:
             raise DriverError(f"{self.uri} is not open")
