@@ -678,7 +678,7 @@ class Drone:
         ``function``, plain or a coroutine function, runs on the event loop.
 
         Args:
-            function: Called in a thread of its own. It returns True to hand over the authority, False or a reason (a
+            function: Called on the event loop. It returns True to hand over the authority, False or a reason (a
                 string) to decline, or None to leave the decision to the proxy. In any case, an application with a
                 strictly higher priority wins after the proxy's ``authority.ask_s``.
 

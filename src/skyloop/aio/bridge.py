@@ -408,7 +408,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # after a cancellation, they must not go on commanding and conflict with the next commands
+        finally:  # after a cancellation, they must not keep commanding and conflict with the next commands
             over = True
             for task in running:
                 task.cancel()

@@ -177,7 +177,7 @@ class Listener(Generic[T]):
 
         ``report`` is called with the listener's ``name`` and each exception of ``function``; the listener's thread has
         the same name. ``on_cancel`` is called with the listener. ``inline``: whether to call the function on the
-        publishing thread instead of on a thread of its own.
+        publishing thread instead of on its own thread.
         """
         self.name = name
         self.errors = 0  #: number of calls that raised

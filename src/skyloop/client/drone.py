@@ -349,7 +349,7 @@ class Drone:
         """Call ``function`` when another application requests the authority that this application holds.
 
         Args:
-            function: Called in a thread of its own. It returns True to hand over the authority, False or a reason (a
+            function: Called in its own thread. It returns True to hand over the authority, False or a reason (a
                 string) to decline, or None to leave the decision to the proxy. In any case, an application with a
                 strictly higher priority wins after the proxy's ``authority.ask_s``.
 

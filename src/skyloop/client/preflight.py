@@ -48,7 +48,7 @@ class PreflightFinding:
     level: Level  #: how serious the finding is
     detail: str  #: the result
     why: str = ""  #: why it matters; empty if there is no problem
-    remedy: str = ""  #: what to do about it; empty if there is nothing to do
+    remedy: str = ""  #: what to do about it; empty if nothing needs to be done
 
 
 @dataclass(frozen=True, slots=True)
