@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import struct
 from enum import IntEnum
-from typing import Final, get_args
+from typing import Final
 
 import msgspec
 
@@ -26,7 +26,7 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: maximum size of a body [bytes], which fits into one datagram; pixels are sent separately
 
-#: All types of samples that a packet can contain, in the order of :class:`Kind`.
+#: All types of samples that a packet can contain.
 Sample = (
     Command
     | Feedback
@@ -66,7 +66,23 @@ class Kind(IntEnum):
     STREAM_REPORT = 15
 
 
-KINDS: Final[dict[type[Sample], Kind]] = dict(zip(get_args(Sample), Kind, strict=True))
+KINDS: Final[dict[type[Sample], Kind]] = {
+    Command: Kind.COMMAND,
+    Feedback: Kind.FEEDBACK,
+    FrameHeader: Kind.FRAME,
+    Event: Kind.EVENT,
+    Request: Kind.REQUEST,
+    Reply: Kind.REPLY,
+    Annotation: Kind.ANNOTATION,
+    Applied: Kind.APPLIED,
+    LogEntry: Kind.LOG,
+    EncodedFrame: Kind.ENCODED,
+    ProcessorResult: Kind.RESULT,
+    ProcessorShare: Kind.SHARE,
+    VehiclePose: Kind.POSE,
+    Overview: Kind.OVERVIEW,
+    StreamReport: Kind.STREAM_REPORT,
+}
 
 _encode_body = msgspec.msgpack.Encoder().encode
 _KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}

@@ -24,9 +24,18 @@ if TYPE_CHECKING:
 #: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Counters that are absent are
 #: exported as 0, except those of a network that is not served.
 _COUNTERS: Final = (
-    *("feedback.published", "feedback.selected", "feedback.missed", "commands.received", "commands.applied"),
-    *("commands.clamped", "commands.superseded", "requests.refused", "packets.malformed", "packets.refused"),
-    *("events.missed", "driver.errors"),
+    "feedback.published",
+    "feedback.selected",
+    "feedback.missed",
+    "commands.received",
+    "commands.applied",
+    "commands.clamped",
+    "commands.superseded",
+    "requests.refused",
+    "packets.malformed",
+    "packets.refused",
+    "events.missed",
+    "driver.errors",
 )
 _NETWORK: Final = ("network.dropped", "network.refused", "network.strays", "network.turned_away")
 #: Counters whose name contains a label. Each pair contains the parts of the name before and after the label.

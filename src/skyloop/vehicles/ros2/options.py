@@ -16,7 +16,17 @@ from skyloop.vehicles.ros2.node import MOST_DOMAIN
 TOPICS: Final = {"image": "image_raw", "cmd_vel": "cmd_vel", "odom": "odom", "battery": "battery_state"}
 SERVICES: Final = ("takeoff", "land")
 _OTHERS: Final = (
-    *("info", "camera", "mount", "width", "height", "fps", "compressed", "stamped", "ground", "timeout", "domain"),
+    "info",
+    "camera",
+    "mount",
+    "width",
+    "height",
+    "fps",
+    "compressed",
+    "stamped",
+    "ground",
+    "timeout",
+    "domain",
 )
 KNOWN: Final = {*TOPICS, *SERVICES, *_OTHERS}
 _NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)

@@ -229,12 +229,22 @@ def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
 #: Functions that make the options, keyed by tag. Options without any values to report are all zero, and 27 is ``Gps``.
 _MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
     **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
-    **{0: _demo, 1: lambda s: o.Time(s.time), 2: _raw, 3: _physical, 5: _euler_angles},
-    **{6: lambda s: o.References(ui_theta=s.progress.pitch, ui_phi=s.progress.roll, ui_psi=s.progress.yaw)},
-    **{7: lambda s: o.Trims(0.0, -s.trim_rad[1], s.trim_rad[0]), 8: _rc_references, 9: _pwm},
-    **{10: _altitude, 13: _vision, 19: _video_stream, 21: _pressure_raw, 22: _magneto},
-    **{24: lambda s: o.KalmanPressure(est_z=s.altitude_mm, est_zdot=-s.velocity_mm_s[2])},
-    **{26: lambda s: o.Wifi(s.link_quality)},
+    0: _demo,
+    1: lambda s: o.Time(s.time),
+    2: _raw,
+    3: _physical,
+    5: _euler_angles,
+    6: lambda s: o.References(ui_theta=s.progress.pitch, ui_phi=s.progress.roll, ui_psi=s.progress.yaw),
+    7: lambda s: o.Trims(0.0, -s.trim_rad[1], s.trim_rad[0]),
+    8: _rc_references,
+    9: _pwm,
+    10: _altitude,
+    13: _vision,
+    19: _video_stream,
+    21: _pressure_raw,
+    22: _magneto,
+    24: lambda s: o.KalmanPressure(est_z=s.altitude_mm, est_zdot=-s.velocity_mm_s[2]),
+    26: lambda s: o.Wifi(s.link_quality),
 }
 
 

@@ -395,17 +395,50 @@ class Landed(IntEnum):
 
 #: ArduCopter's modes by number (``mode.h``).
 COPTER_MODES: Final = {
-    **{0: "STABILIZE", 1: "ACRO", 2: "ALT_HOLD", 3: "AUTO", 4: "GUIDED", 5: "LOITER", 6: "RTL", 7: "CIRCLE", 9: "LAND"},
-    **{11: "DRIFT", 13: "SPORT", 14: "FLIP", 15: "AUTOTUNE", 16: "POSHOLD", 17: "BRAKE", 18: "THROW"},
-    **{19: "AVOID_ADSB", 20: "GUIDED_NOGPS", 21: "SMART_RTL", 22: "FLOWHOLD", 23: "FOLLOW", 24: "ZIGZAG"},
-    **{25: "SYSTEMID", 26: "AUTOROTATE", 27: "AUTO_RTL", 28: "TURTLE"},
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    5: "LOITER",
+    6: "RTL",
+    7: "CIRCLE",
+    9: "LAND",
+    11: "DRIFT",
+    13: "SPORT",
+    14: "FLIP",
+    15: "AUTOTUNE",
+    16: "POSHOLD",
+    17: "BRAKE",
+    18: "THROW",
+    19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS",
+    21: "SMART_RTL",
+    22: "FLOWHOLD",
+    23: "FOLLOW",
+    24: "ZIGZAG",
+    25: "SYSTEMID",
+    26: "AUTOROTATE",
+    27: "AUTO_RTL",
+    28: "TURTLE",
 }
 COPTER_NUMBERS: Final = {name: number for number, name in COPTER_MODES.items()}
 #: PX4's modes by main mode and sub mode (``px4_custom_mode.h``).
 PX4_MODES: Final = {
-    **{(1, 0): "MANUAL", (2, 0): "ALTCTL", (3, 0): "POSCTL", (5, 0): "ACRO", (6, 0): "OFFBOARD", (7, 0): "STABILIZED"},
-    **{(4, 1): "AUTO.READY", (4, 2): "AUTO.TAKEOFF", (4, 3): "AUTO.LOITER", (4, 4): "AUTO.MISSION", (4, 5): "AUTO.RTL"},
-    **{(4, 6): "AUTO.LAND", (4, 8): "AUTO.FOLLOW", (4, 9): "AUTO.PRECLAND"},
+    (1, 0): "MANUAL",
+    (2, 0): "ALTCTL",
+    (3, 0): "POSCTL",
+    (4, 1): "AUTO.READY",
+    (4, 2): "AUTO.TAKEOFF",
+    (4, 3): "AUTO.LOITER",
+    (4, 4): "AUTO.MISSION",
+    (4, 5): "AUTO.RTL",
+    (4, 6): "AUTO.LAND",
+    (4, 8): "AUTO.FOLLOW",
+    (4, 9): "AUTO.PRECLAND",
+    (5, 0): "ACRO",
+    (6, 0): "OFFBOARD",
+    (7, 0): "STABILIZED",
 }
 PX4_NUMBERS: Final = {name: numbers for numbers, name in PX4_MODES.items()}
 
