@@ -62,16 +62,17 @@ def test_the_fields_of_the_first_packets() -> None:
 
 
 def test_numbers_in_the_text() -> None:
-    assert f"`revision` uint, now {packets.REVISION}" in FABRIC
-    assert f"1 to {MAX_TOPIC} characters" in FABRIC
-    assert f"at most {packets.MAX_REASON} bytes" in FABRIC
-    assert f"Lease {config.LEASE_S * 1000:g} ms" in FABRIC
-    assert f"seen within {registry.CONFIRM_S:g} s" in FABRIC
-    assert f"at most {delivery.DEPTH} packets or {delivery.MAX_BYTES >> 20} MiB" in FABRIC
-    assert f"every {delivery.ACKNOWLEDGE_AFTER} packets" in FABRIC
-    assert f"At most {frames.WINDOW} frames of a request" in FABRIC
-    assert f"A frame not acknowledged for {frames.LOST_NS / 1e9:g} s" in FABRIC
-    assert f"longer by {sealing.TRAILER} bytes" in FABRIC
-    assert f"{sealing.TAG} bytes longer" in FABRIC
-    assert f"more than {sealing.WIDTH} numbers behind" in FABRIC
-    assert f"uses it {sealing.SWITCH_S:g} s later" in FABRIC
+    text = " ".join(FABRIC.split())  # wherever its lines are wrapped
+    assert f"`revision` uint, now {packets.REVISION}" in text
+    assert f"1 to {MAX_TOPIC} characters" in text
+    assert f"at most {packets.MAX_REASON} bytes" in text
+    assert f"Lease {config.LEASE_S * 1000:g} ms" in text
+    assert f"seen within {registry.CONFIRM_S:g} s" in text
+    assert f"at most {delivery.DEPTH} packets or {delivery.MAX_BYTES >> 20} MiB" in text
+    assert f"every {delivery.ACKNOWLEDGE_AFTER} packets" in text
+    assert f"At most {frames.WINDOW} frames of a request" in text
+    assert f"A frame not acknowledged for {frames.LOST_NS / 1e9:g} s" in text
+    assert f"longer by {sealing.TRAILER} bytes" in text
+    assert f"{sealing.TAG} bytes longer" in text
+    assert f"more than {sealing.WIDTH} numbers behind" in text
+    assert f"uses it {sealing.SWITCH_S:g} s later" in text
