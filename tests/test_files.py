@@ -13,8 +13,9 @@ import skyloop.sim
 from skyloop.cockpit.access import read_tokens
 from skyloop.control.route import Route, RouteWaypoint, load_route
 from skyloop.errors import FileFormatError, UsageError
-from skyloop.files import expand, read_bytes, read_json, read_text, replacing, wait_readable, write
+from skyloop.files import expand, read_bytes, read_json, read_text, replacing, write
 from skyloop.host.fleet import read_fleet
+from skyloop.platform import wait_readable
 from skyloop.sim.world_file import load_world
 
 
@@ -46,7 +47,7 @@ def test_a_descriptor_of_any_number_is_waited_for() -> None:
 def test_nothing_in_the_package_waits_by_select() -> None:
     package = Path(skyloop.__file__).parent
     found = [path.name for path in package.rglob("*.py") if "select.select(" in path.read_text(encoding="utf-8")]
-    assert found == ["files.py"], "skyloop.files.wait_readable takes descriptors of all numbers"
+    assert found == ["platform.py"], "skyloop.platform.wait_readable takes descriptors of all numbers"
 
 
 def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:

@@ -48,6 +48,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.feedback import typical_feedback
+from skyloop.platform import usable_cores
 from skyloop.proxy import Proxy
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
@@ -93,12 +94,12 @@ class Machine(msgspec.Struct, frozen=True):
         """Describe this machine."""
         return cls(
             cpu=cpu_model(_read("/proc/cpuinfo")) or platform.machine(),
-            cores=len(os.sched_getaffinity(0)),
+            cores=usable_cores(),
             system=f"{os_name(_read('/etc/os-release')) or platform.system()} {platform.machine()}",
             kernel=f"{platform.system()} {numbers_of(platform.release())}",
             python=platform.python_version(),
             packages={name: version for name in _PACKAGES if (version := _version(name))},
-            load=round(os.getloadavg()[0], 1),
+            load=round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None,
         )
 
     def __str__(self) -> str:
@@ -126,7 +127,7 @@ def numbers_of(release: str) -> str:
 
 def _read(path: str) -> str:
     try:
-        return Path(path).read_text()
+        return Path(path).read_text(encoding="utf-8")
     except OSError:
         return ""
 

@@ -20,6 +20,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import IO, Final, Protocol
 
+from skyloop.platform import own_session, read_tail
+
 GRACE_S: Final = 4.0  #: time limit for a child to exit on request, and again after it is terminated
 _TAIL: Final = 2000  # bytes of a child's standard error that an error message shows
 _LOOK_S: Final = 0.25  # how often to check a child that may hang silently
@@ -86,9 +88,8 @@ class ChildProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._errors,
-                start_new_session=True,
-                pass_fds=inherited,
                 env=None if handed is None else {**os.environ, _HANDED: handed},
+                **own_session(inherited),
             )
         except BaseException:
             if self._errors is not None:
@@ -115,9 +116,7 @@ class ChildProcess:
         """Return the end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._stderr_tail
-        number = self._errors.fileno()  # don't seek, because the child writes at the position of this file
-        size = os.fstat(number).st_size
-        return os.pread(number, _TAIL, max(0, size - _TAIL)).decode(errors="replace").strip()
+        return read_tail(self._errors.fileno(), _TAIL).decode(errors="replace").strip()
 
     @property
     def ending(self) -> str:
@@ -138,7 +137,7 @@ class ChildProcess:
             self._process.stdin.close()
 
     def terminate(self) -> None:
-        """Send SIGTERM to the child. Does not wait. Idempotent."""
+        """Send SIGTERM to the child; on Windows, kill it. Does not wait. Idempotent."""
         if self._ours:
             self._process.terminate()
 

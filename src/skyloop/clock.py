@@ -8,6 +8,7 @@ depend on wall-clock time.
 from __future__ import annotations
 
 import functools
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,8 +23,10 @@ NS_PER_S: Final = 1_000_000_000
 #: 5 ms, each packet in a flood could delay a command by 5 ms.
 SWITCH_INTERVAL_S: Final = 0.001
 
-monotonic_ns: Clock = time.monotonic_ns
-_BOOTTIME: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
+#: ``time.monotonic`` counts in steps of 15.6 ms on Windows before Python 3.13, where it is the performance counter.
+monotonic_ns: Clock = (
+    time.perf_counter_ns if sys.platform == "win32" and sys.version_info < (3, 13) else time.monotonic_ns
+)
 
 
 def seconds(ns: int) -> float:
@@ -42,9 +45,9 @@ def slept_ns() -> int:
     The monotonic clock stops during sleep: anything received earlier is older than its timestamp suggests. The result
     may be out of date for a moment, but is never too large.
     """
-    if _BOOTTIME is None:
+    if sys.platform != "linux":
         return 0
-    return time.clock_gettime_ns(_BOOTTIME) - time.monotonic_ns()
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
 
 
 def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
@@ -61,7 +64,7 @@ def beats(period_s: float, ended: threading.Event) -> Iterator[None]:
 def boot_id() -> str:
     """Return an identifier of the kernel's current boot; empty if unknown, as on systems other than Linux."""
     try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
         return ""
 

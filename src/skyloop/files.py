@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
-import select
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import msgspec
 
@@ -56,24 +54,6 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
         return msgspec.json.decode(decoded(content), type=kind)
     except (msgspec.MsgspecError, UsageError, UnicodeDecodeError, RecursionError) as error:
         raise FileFormatError(f"{path} is not {what}: {error}") from None
-
-
-class Descriptor(Protocol):
-    """Anything with a file descriptor."""
-
-    def fileno(self) -> int: ...
-
-
-def wait_readable(source: Descriptor | int, within_s: float) -> bool:
-    """Wait until a descriptor is readable or closed; return False if neither happens within ``within_s`` [s].
-
-    Works for any descriptor number; ``select.select`` raises an error from 1,024 on.
-    """
-    if not hasattr(select, "poll"):  # Windows
-        return bool(select.select([source], [], [], within_s)[0])
-    poll = select.poll()
-    poll.register(source, select.POLLIN)
-    return bool(poll.poll(math.ceil(within_s * 1000.0)))
 
 
 def expand(path: str | Path) -> Path:

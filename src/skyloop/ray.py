@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import sys
 import threading
 import time
@@ -164,7 +165,7 @@ class _Actor:
     def _begin(self, kind: type[Any], target: str, settings: Settings) -> None:
         from skyloop.client import connect
 
-        name = f"{settings.name[:32]}@{os.uname().nodename[:20]}:{os.getpid()}"
+        name = f"{settings.name[:32]}@{platform.node()[:20]}:{os.getpid()}"
         processor = Code(kind, settings.code).make()
         drone = connect(target, access="observe", name=name)
         try:

@@ -298,6 +298,26 @@ def test_https_with_a_generated_certificate(
         with_certificate(access, tmp_path / "keys" / "pages")
 
 
+def test_where_no_one_tells_whose_program_connects_the_browser_is_paired(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As on macOS and Windows; the program that started the cockpit has a token to observe."""
+    monkeypatch.setattr("skyloop.cockpit.server.sees_peers", lambda: False)
+    token = "of-the-program-that-started-it"
+    with served(access=Access(observer_token=token), recordings=tmp_path) as address:
+        page, _, code = address.partition("/#pair=")
+        assert ask(page, "/api/statistics", token)["frames_sent"] == 0
+        for wrong in (None, "x" * 24, code):
+            with pytest.raises(urllib.error.HTTPError, match="401"):
+                ask(page, "/api/statistics", wrong)
+        headers = {"content-type": "application/json", "origin": page}
+        login = urllib.request.Request(f"{page}/api/login", json.dumps({"token": code}).encode(), headers)
+        with urllib.request.urlopen(login) as answer:
+            assert json.load(answer)["role"] == "pilot"
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(login)
+
+
 # As a process of its own --------------------------------------------------------------------------------------------
 
 

@@ -7,16 +7,14 @@ is longer than the delay after which terminals repeat a key; repeats hold the st
 from __future__ import annotations
 
 import math
-import os
 import re
-import signal
 import sys
 from collections.abc import Sequence
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Final, Literal, NamedTuple, Self
 
-from skyloop.errors import UnsupportedError, UsageError
-from skyloop.files import wait_readable
+from skyloop.errors import UsageError
 from skyloop.messages import FlightState
+from skyloop.platform import single_keys
 
 HOLD_S: Final = 0.6  #: how long a key press moves its stick
 TWICE_S: Final = 1.0  #: pressing Esc twice within this time cuts the motors
@@ -275,48 +273,21 @@ class Tokenizer:
 class Keyboard:
     """Reads the terminal's keys one at a time, without Enter; a context manager that restores the terminal.
 
-    Raise ``UsageError`` if standard input is not a terminal, and ``UnsupportedError`` if this platform's terminals
-    can't report single keys.
+    Raise ``UsageError`` if standard input is not a terminal.
     """
 
     def __init__(self) -> None:
-        try:
-            import termios
-            import tty
-        except ImportError:
-            raise UnsupportedError(
-                f"flying with the terminal's keys needs Linux or macOS, but this is {sys.platform}; fly on the page: "
-                "skyloop cockpit"
-            ) from None
-        self._termios, self._tty = termios, tty
         if not sys.stdin.isatty():
             raise UsageError("standard input is not a terminal: flying by keys needs one")
-        self._fd = sys.stdin.fileno()
-        self._before: list[Any] = termios.tcgetattr(self._fd)
+        self._terminal = single_keys(sys.stdin.fileno())
         self._tokens = Tokenizer()
-        self._continued: Any = None  # the previous handler of SIGCONT
 
     def __enter__(self) -> Self:
-        self._set_mode()
-        self._continued = signal.signal(
-            signal.SIGCONT, lambda *_: self._set_mode()
-        )  # while the process was suspended, the shell may have set its own mode
+        self._read = self._terminal.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGCONT, self._continued)
-        self._termios.tcsetattr(self._fd, self._termios.TCSANOW, self._before)
-
-    def _set_mode(self) -> None:
-        """Read single keys. Ctrl-C still interrupts; Ctrl-Z does not suspend a flight, and Ctrl-S has no effect."""
-        termios = self._termios
-        self._tty.setcbreak(self._fd, termios.TCSANOW)
-        mode = termios.tcgetattr(self._fd)
-        mode[0] &= ~termios.IXON
-        for name in ("VSUSP", "VDSUSP"):
-            if hasattr(termios, name):
-                mode[6][getattr(termios, name)] = bytes((os.fpathconf(self._fd, "PC_VDISABLE"),))
-        termios.tcsetattr(self._fd, termios.TCSANOW, mode)
+        self._terminal.__exit__(None, None, None)
 
     @property
     def other(self) -> str:
@@ -325,12 +296,9 @@ class Keyboard:
 
     def keys(self, within_s: float) -> list[str]:
         """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal has been closed."""
-        if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
+        data = self._read(_ESC_ALONE_S if self._tokens.waits else within_s)
+        if data is None:
             return self._tokens.flush()
-        data = os.read(self._fd, 1024)
         if not data:
             raise EOFError
         return self._tokens.feed(data)
-
-    def _ready(self, within_s: float) -> bool:
-        return wait_readable(self._fd, within_s)

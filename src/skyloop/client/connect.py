@@ -22,7 +22,7 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.drone import Access, Drone, DroneOptions
 from skyloop.client.piloting import OnExit
 from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, UnknownNameError, UsageError
-from skyloop.files import wait_readable
+from skyloop.platform import read_within
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 NAME_TIMEOUT_S: Final = 5.0
@@ -295,8 +295,7 @@ class PrivateProxy:
 
     def _wait_for_output(self) -> None:
         """Sleep until the child prints something (such as its readiness) or ends, or until a short time has passed."""
-        stdout = self._process.stdout
-        if wait_readable(stdout, _OUTPUT_WAIT_S) and not os.read(stdout.fileno(), 4096):
+        if read_within(self._process.stdout, _OUTPUT_WAIT_S) == b"":
             time.sleep(0.005)  # the child has closed its output and is about to exit
 
 

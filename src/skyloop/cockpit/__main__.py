@@ -10,9 +10,9 @@ import sys
 import threading
 from pathlib import Path
 
-from skyloop.child_process import on_parent_end
+from skyloop.child_process import handed_over, on_parent_end
 from skyloop.cockpit.addresses import DEFAULT_PORT
-from skyloop.cockpit.server import RECORDINGS, serve_cockpit
+from skyloop.cockpit.server import RECORDINGS, Access, serve_cockpit
 from skyloop.errors import SkyloopError
 from skyloop.network.config import choose
 
@@ -36,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
         serve_cockpit(
             given.names,
             port=given.port,
+            access=Access(observer_token=handed_over()),
             recordings=given.recordings,
             on_ready=lambda address: print(address, flush=True),
             stop=stop,

@@ -33,6 +33,7 @@ from skyloop.clock import Clock, boot_id, monotonic_ns, nanoseconds, seconds
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import decoded
 from skyloop.messages import Role
+from skyloop.platform import is_open_to_others, is_own_user
 
 SESSION_S: Final = 12 * 3600.0  #: period for which a session is valid
 PAIRING_S: Final = 3600.0  #: period for which a pairing code is valid
@@ -140,13 +141,12 @@ class OpenGate:
     def __init__(self, role: Role = Role.PILOT, uid_of: Callable[[Endpoint, Endpoint], int | None] = peer_uid) -> None:
         self._person = Person(role)
         self._uid_of = uid_of
-        self._allowed = {0, os.geteuid()}
 
     def person(self, scope: Scope) -> Person | None:
         client, server = scope.get("client"), scope.get("server")
         if client is None or server is None:
             return None
-        return self._person if self._uid_of(tuple(client), tuple(server)) in self._allowed else None
+        return self._person if is_own_user(self._uid_of(tuple(client), tuple(server)), or_root=True) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,7 +325,7 @@ def read_tokens(path: Path) -> list[Token]:
         text = decoded(path.read_bytes())
     except (OSError, UnicodeDecodeError) as error:
         raise UsageError(f"the token file {path} can't be read: {error}") from None
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+    if is_open_to_others(mode):
         raise UsageError(f"the token file {path} is readable by others (mode {stat.S_IMODE(mode):04o}): chmod 600 it")
     tokens: list[Token] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -447,10 +447,10 @@ class SessionFile:
     def load(self) -> list[Session]:
         """Return the sessions; none if the file is missing, damaged, owned by others or from before a reboot."""
         try:
-            descriptor = os.open(self._path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+            descriptor = os.open(self._path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
             with os.fdopen(descriptor, "rb") as file:
                 found = os.fstat(file.fileno())
-                own = found.st_uid == os.geteuid() and not found.st_mode & (stat.S_IRWXG | stat.S_IRWXO)
+                own = is_own_user(found.st_uid) and not is_open_to_others(found.st_mode)
                 content = msgspec.json.decode(file.read(MAX_BYTES), type=_Content) if own else None
         except (OSError, msgspec.DecodeError):
             return []
@@ -462,7 +462,7 @@ class SessionFile:
         try:
             with suppress(FileNotFoundError):
                 new.unlink()
-            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+            descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(msgspec.json.encode(_Content(self._boot, list(sessions))))
             new.replace(self._path)

@@ -112,15 +112,15 @@ def own_addresses() -> list[str]:
 
     Used on networks that have no default route, such as a drone's own Wi-Fi or a lab without internet access.
     """
+    found: list[str] = []
     if sys.platform != "linux":
-        return []
-    from fcntl import ioctl
+        return found
+    import fcntl
 
-    found = []
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as any_socket:
         for _, name in socket.if_nameindex():
             with suppress(OSError):  # the interface has no address
-                answer = ioctl(any_socket, _SIOCGIFADDR, struct.pack("256s", name.encode()))
+                answer = fcntl.ioctl(any_socket, _SIOCGIFADDR, struct.pack("256s", name.encode()))
                 found.append(socket.inet_ntoa(answer[20:24]))
     return [address for address in found if not ipaddress.ip_address(address).is_loopback]
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
+import secrets
 import sys
 import time
 import urllib.request
 from pathlib import Path
 from typing import Any, Self
+from urllib.parse import urldefrag
 
 from skyloop.child_process import ChildProcess
 from skyloop.errors import LinkError
-from skyloop.files import wait_readable
+from skyloop.platform import read_within
 
 _ASK_S = 2.0
 
@@ -33,12 +34,13 @@ class CockpitProcess:
         options = [] if recordings is None else ["--recordings", str(recordings)]
         options += [] if port is None else ["--port", str(port)]
         command = [sys.executable, "-m", "skyloop.cockpit", *names, *options]
-        self._process = ChildProcess([*command, "--parent-fd", "0"])
+        self._token = secrets.token_urlsafe(24)  # for systems where the cockpit can't see whose program this is
+        self._process = ChildProcess([*command, "--parent-fd", "0"], handed=self._token)
         self.pid = self._process.pid  #: the child's process id
         self._address: str | None = None
 
     def address(self, timeout_s: float = 15.0) -> str:
-        """Wait until the page is served.
+        """Wait until the page is served; return its address, with a pairing code where the cockpit pairs browsers.
 
         Raise ``LinkError`` if the page was not served in time or the child ended; the error contains its last line of
         standard error.
@@ -46,8 +48,7 @@ class CockpitProcess:
         deadline = time.monotonic() + timeout_s
         line = b""
         while self._address is None:
-            ready = wait_readable(self._process.stdout, max(0.0, deadline - time.monotonic()))
-            more = os.read(self._process.stdout.fileno(), 4096) if ready else b""
+            more = read_within(self._process.stdout, max(0.0, deadline - time.monotonic()))
             if not more:
                 raise LinkError(f"the cockpit did not start: {self._complaint()}")
             line += more
@@ -58,7 +59,9 @@ class CockpitProcess:
     def statistics(self) -> dict[str, Any]:
         """Return the counts of messages sent to the cockpit's pages, as in ``/api/statistics``."""
         try:
-            with urllib.request.urlopen(f"{self.address()}api/statistics", timeout=_ASK_S) as answer:
+            address = f"{urldefrag(self.address()).url}api/statistics"
+            request = urllib.request.Request(address, headers={"Authorization": f"Bearer {self._token}"})
+            with urllib.request.urlopen(request, timeout=_ASK_S) as answer:
                 values: dict[str, Any] = json.load(answer)
                 return values
         except (OSError, ValueError) as error:

@@ -7,13 +7,12 @@ ones, so a page receives all of them in order or resumes at a key frame. This mo
 from __future__ import annotations
 
 import asyncio
-import os
 import struct
-import sys
 import threading
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
@@ -23,6 +22,7 @@ from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.feeds import Wake, call_soon
 from skyloop.extend import stream_channel
 from skyloop.messages import CameraInfo, EncodedFrame
+from skyloop.platform import lower_priority
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -36,14 +36,9 @@ _encode = msgspec.json.Encoder().encode
 NICENESS: Final = 10  #: niceness of the encoding thread
 
 
-def _give_way() -> None:
-    if sys.platform == "linux":  # on other systems, only whole processes have a priority
-        os.nice(NICENESS)
-
-
 #: One thread for all cameras, because encoding for many pages must not take CPU cores away from flying. The event loop
 #: keeps its original priority: stick and stop commands pass through it, and a browser must not starve it.
-_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=_give_way)
+_ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=partial(lower_priority, NICENESS, thread_only=True))
 KEPT: Final = 16  #: number of pictures kept per stream; a page further behind resumes at a key frame
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: only a few scales, so that similar panes share a stream
 RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: only a few rates [kbit/s]

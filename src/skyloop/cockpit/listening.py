@@ -17,6 +17,7 @@ import errno
 import logging
 import socket
 import ssl
+import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -291,10 +292,10 @@ class Listener:
 
 def places_here() -> Places:
     """Return the limits that suit the descriptor limit of this process."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit
+    if sys.platform == "win32":  # without such a limit
         return Places()
+    import resource
+
     descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return Places() if descriptors == resource.RLIM_INFINITY else Places.within(descriptors)
 

@@ -37,6 +37,7 @@ from skyloop.errors import (
     UsageError,
 )
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Refusal, Severity
+from skyloop.platform import lower_priority
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import ENDING, Described, describe, shown_name
 from skyloop.recording.plain import Course
@@ -458,7 +459,7 @@ def run_child(arguments: Sequence[str]) -> int:
     ``arguments``: ``report`` or ``timeline``, then FILE TARGET [DRONE], from the command line. Return the exit code: 0,
     or 2 after printing a line of explanation.
     """
-    os.nice(NICENESS)
+    lower_priority(NICENESS)
     on_parent_end(partial(os._exit, 1))
     from skyloop.recording.reader import Recording
 

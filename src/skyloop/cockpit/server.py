@@ -9,7 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, Usage
 from skyloop.messages import Role
 from skyloop.metrics import client_readings
 from skyloop.metrics.endpoint import Reading
+from skyloop.platform import on_signals, sees_peers
 
 if TYPE_CHECKING:
     import uvicorn
@@ -51,7 +52,9 @@ class Access:
     certificates; a certificate's OU is the role. ``role``: the role of every user, unless tokens or certificates
     determine it. ``hostnames``: names that browsers use to reach this machine if they don't use its address. ``pair``:
     admit the first browser that opens the address in the QR code, with role ``role``; each code works once.
-    ``page_authority``: PEM file of the authority that signed ``tls_cert``, offered for browsers to trust.
+    Browsers are also paired if there are neither tokens nor certificates and this system does not tell whose program
+    connects (:func:`skyloop.platform.sees_peers`). ``page_authority``: PEM file of the authority that signed
+    ``tls_cert``, offered for browsers to trust. ``observer_token``: admits the program that started the cockpit.
 
     Raises:
         UsageError: The options are contradictory.
@@ -66,6 +69,7 @@ class Access:
     hostnames: tuple[str, ...] = ()
     pair: bool = False
     page_authority: Path | None = None
+    observer_token: str | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if (self.tls_cert is None) != (self.tls_key is None):
@@ -107,8 +111,9 @@ def serve_cockpit(
         free one).
         access: Who may connect, and from where; by default only this user, on this machine, as a pilot.
         recordings: The folder for recordings, which is created when needed.
-        on_ready: Called once on this thread with the page's address. By default, the address is printed, with a QR code
-            if other machines can reach the page and standard output is a terminal.
+        on_ready: Called once on this thread with the page's address, which contains a code where browsers have to be
+            paired. By default, the address is printed, with a QR code if other machines can reach the page and standard
+            output is a terminal.
         stop: Stops the server when set from any thread.
         network: Also show drones reachable over this network.
         world: File or name of a shipped world, used as the surroundings of drones that report none.
@@ -149,6 +154,7 @@ def serve_cockpit(
         _check_names(names, finder)
         pairing = gate.pairing if isinstance(gate, TokenGate) else None
         ready = on_ready or Announcer(pairing, loopback)
+        code = f"#pair={pairing.code()}" if on_ready is not None and pairing is not None and not access.pair else ""
 
         from skyloop.cockpit.app import create_app
         from skyloop.cockpit.fleet import Fleet
@@ -174,7 +180,7 @@ def serve_cockpit(
             print(endpoint.announcement, file=sys.stderr, flush=True)
         expire_codes = pairing.expire if pairing is not None else lambda: None
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: ready(page), stop, expire_codes))
+        asyncio.run(_run(server, listener, lambda: ready(page + code), stop, expire_codes))
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
@@ -231,21 +237,18 @@ def _check_names(names: Sequence[str], finder: Finder) -> None:
 
 
 def _gate(access: Access, port: int) -> Gate:
-    from skyloop.cockpit.access import CertificateGate, OpenGate, Pairing, TokenGate, read_tokens
+    from skyloop.cockpit.access import CertificateGate, OpenGate, Pairing, Person, Token, TokenGate, read_tokens
 
     if access.client_ca is not None:
         return CertificateGate()
-    if access.token_file is not None or access.pair:
-        tokens = [] if access.token_file is None else read_tokens(access.token_file)
-        cookie = f"skyloop-cockpit-{port}"  # browsers share cookies between all ports of a host
-        pairing = Pairing(access.role) if access.pair else None
-        return TokenGate(tokens, cookie, pairing=pairing, kept=_session_file(cookie))
-    if sys.platform != "linux":
-        raise UsageError(
-            f"on {sys.platform} the cockpit can't see whose program connects, so it needs a token: give "
-            "--token-file FILE with lines of ROLE TOKEN [NAME]"
-        )
-    return OpenGate(access.role)
+    pairs = access.pair or (access.token_file is None and not sees_peers())
+    if access.token_file is None and not pairs:
+        return OpenGate(access.role)
+    tokens = [] if access.token_file is None else read_tokens(access.token_file)
+    if access.observer_token is not None:
+        tokens.append(Token(Person(Role.OBSERVER), access.observer_token.encode()))
+    cookie = f"skyloop-cockpit-{port}"  # browsers share cookies between all ports of a host
+    return TokenGate(tokens, cookie, pairing=Pairing(access.role) if pairs else None, kept=_session_file(cookie))
 
 
 def _session_file(cookie: str) -> SessionFile | None:
@@ -356,8 +359,7 @@ async def _run(
 ) -> None:
     ending = asyncio.Event()
     if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            asyncio.get_running_loop().add_signal_handler(number, ending.set)
+        on_signals((signal.SIGINT, signal.SIGTERM), ending.set)
     serving = asyncio.create_task(server.serve(sockets=[]))
     while not server.started and not serving.done():
         await asyncio.sleep(_LOOK_S / 10)

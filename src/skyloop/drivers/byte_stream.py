@@ -6,6 +6,7 @@ import os
 import re
 import socket
 import struct
+import sys
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
@@ -15,7 +16,7 @@ from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.errors import MissingExtraError
-from skyloop.files import wait_readable
+from skyloop.platform import wait_readable
 
 CONNECT_S: Final = 1.0
 STUCK_NS: Final = nanoseconds(0.5)  #: time after which a connection with a full buffer is considered dead
@@ -240,10 +241,12 @@ class TcpStream(ByteStream):
         self._socket.close()
 
     def _waiting(self) -> int:
-        with suppress(Exception):  # the count is unavailable, or the connection has ended
-            import fcntl
-            import termios
+        if sys.platform == "win32":
+            return 0  # no such count
+        import fcntl
+        import termios
 
+        with suppress(Exception):  # the count is unavailable, or the connection has ended
             self._socket.getpeername()  # raises if the connection has ended: lost bytes would still be counted
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count

@@ -9,6 +9,7 @@ import errno
 import ipaddress
 import selectors
 import socket
+import sys
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -302,6 +303,8 @@ class VehicleLink(ABC, Generic[S]):
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when there is work to do."""
+        if sys.platform == "win32":  # whose selector has none; a host there gives each link a thread
+            raise NotImplementedError
         return self._selector.fileno()
 
     def serve(self, *, readable: bool) -> int | None:

@@ -9,8 +9,10 @@ import errno
 import os
 import socket
 import stat
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from pathlib import Path
@@ -307,12 +309,12 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
 def _permission(port: str, status: os.stat_result) -> str:
     if not status.st_mode & stat.S_IRGRP or not status.st_mode & stat.S_IWGRP or status.st_gid == 0:
         return f"add a udev rule that lets this user open {port}"
-    try:
+    group = str(status.st_gid)
+    if sys.platform != "win32":
         import grp
 
-        group = grp.getgrgid(status.st_gid).gr_name
-    except (KeyError, ImportError):  # Windows has no groups
-        group = str(status.st_gid)
+        with suppress(KeyError):
+            group = grp.getgrgid(status.st_gid).gr_name
     return f"join the group {group}: sudo usermod -a -G {group} $USER, then log in again"
 
 

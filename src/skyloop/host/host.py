@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -112,7 +113,13 @@ class Host:
             return OwnProcessVehicle(settings, self.announce)
         jobs = self._workers.queue()
         return SharedVehicle(
-            settings, self._reactor, jobs, network, self._make_driver, self._overview, self._serve_link
+            settings,
+            self._reactor,
+            jobs,
+            network,
+            self._make_driver,
+            self._overview,
+            self._serve_link if sys.platform != "win32" else None,  # whose selectors can't be waited for together
         )
 
     def _serve_link(self, vehicle: SharedVehicle, link: ServedLink) -> None:

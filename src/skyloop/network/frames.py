@@ -10,13 +10,12 @@ import contextlib
 import itertools
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.clock import Clock, nanoseconds
+from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.messages.subscription import FrameFilter, VideoRequest
@@ -91,7 +90,7 @@ class Variant:
 class FramePublisher:
     """Publishes the frames of all of a server's cameras. Thread-safe; copies, encodes and sends outside its lock."""
 
-    def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
+    def __init__(self, send: Send, name: str, clock: Clock = monotonic_ns) -> None:
         #: Returns why a topic can't be subscribed to, or an empty string if it can.
         self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send

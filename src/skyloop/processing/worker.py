@@ -24,7 +24,7 @@ from skyloop.client.channels import Mailbox, checked_age, checked_name
 from skyloop.client.frame import Arrival
 from skyloop.client.publishing import Membership
 from skyloop.client.video import VideoChannel
-from skyloop.clock import NS_PER_S, Clock
+from skyloop.clock import NS_PER_S, Clock, monotonic_ns
 from skyloop.control.loading import load_module
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.extend import join_processor, video_channel
@@ -225,7 +225,7 @@ class Worker:
         self._drone = drone
         self._process = processor.process
         self._report = tell
-        self._clock = time.monotonic_ns
+        self._clock = monotonic_ns
         self._tally = Tally(self._clock)
         self._stopped = threading.Event()
         self._busy_since_s: float | None = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import signal
 import sys
 import threading
@@ -23,6 +22,7 @@ from skyloop.client.channels import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known
 from skyloop.messages import EventKind, Severity
+from skyloop.platform import lower_priority
 from skyloop.recording.backlog import Backlog
 from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
 from skyloop.recording.options import (
@@ -363,8 +363,7 @@ def run_child(order: Order) -> int:
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     on_parent_end(stop.set)
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
+    lower_priority(_NICE)
     # Events are sent on this thread, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:

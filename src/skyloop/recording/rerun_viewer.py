@@ -16,8 +16,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
-import signal
 import socket
 import subprocess
 import sys
@@ -53,6 +51,7 @@ from skyloop.messages.command import SET_POINTS
 from skyloop.messages.frame import H264, Chain
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.messages.relayed import Text
+from skyloop.platform import end_session, own_session
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, FrameRecord
 from skyloop.recording.options import MB, VIDEO
@@ -179,7 +178,7 @@ def _start(host: str, port: int) -> None:
     # Rerun's own spawn() would listen on all network interfaces.
     command = [sys.executable, "-m", "rerun_cli", "--bind", host, "--port", str(port), "--expect-data-soon"]
     try:
-        viewer = subprocess.Popen(command, start_new_session=True, stdin=subprocess.DEVNULL)
+        viewer = subprocess.Popen(command, stdin=subprocess.DEVNULL, **own_session())
     except OSError as error:
         raise LinkError(f"Rerun's viewer can't be started: {error}") from None
     end = time.monotonic() + _START_S
@@ -191,7 +190,7 @@ def _start(host: str, port: int) -> None:
                 "show the drones in a viewer elsewhere with --connect URL"
             )
         if time.monotonic() > end:
-            os.killpg(viewer.pid, signal.SIGTERM)  # the viewer is a child of the process that was started here
+            end_session(viewer)  # the viewer is a child of the process that was started here
             raise NoAnswerError(f"Rerun's viewer is not listening on {host}:{port} after {_START_S:g} s")
         time.sleep(_LOOK_S)
         listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0

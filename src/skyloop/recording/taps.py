@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -33,6 +32,7 @@ from skyloop.messages import (
     Severity,
 )
 from skyloop.messages.frame import H264, Chain
+from skyloop.platform import lower_priority
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
@@ -530,5 +530,4 @@ class View:
 
 def give_way() -> None:
     """Lower the priority of this process and of threads it starts later, so that flying takes precedence."""
-    if hasattr(os, "nice"):
-        os.nice(NICENESS)
+    lower_priority(NICENESS)

@@ -176,7 +176,7 @@ def forget_error() -> None:
 
     Otherwise, ROS 2 prints this error together with the next one.
     """
-    for line in Path("/proc/self/maps").read_text().splitlines():
+    for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
         if "/librcutils.so" in line:
             ctypes.CDLL(line.split(maxsplit=5)[5]).rcutils_reset_error()
             return

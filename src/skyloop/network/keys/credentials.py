@@ -28,11 +28,12 @@ from typing import Final
 
 import msgspec
 
-from skyloop.errors import FileFormatError, UnsupportedError, UsageError
+from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import expand, read_bytes
 from skyloop.network.keys import certificates
 from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
+from skyloop.platform import is_open_to_others, lock_file
 
 FORMAT: Final = 1
 _PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
@@ -41,7 +42,6 @@ CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
 MAX_BYTES: Final = 16 << 20  #: maximum size of a file; a roster with 10 000 identities takes 3 MB
-_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 NOTICE: Final = timedelta(days=7)  #: time before an expiry from which it is announced
 
 
@@ -260,7 +260,7 @@ def make_directory(path: Path) -> None:
         mode = path.stat().st_mode
     except OSError as error:
         raise UsageError(f"{path} can't be made: {error.strerror}") from None
-    if mode & _OTHERS:
+    if is_open_to_others(mode):
         raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
 
 
@@ -288,7 +288,7 @@ def read_private(path: Path, what: str) -> bytes:
     """Read a file that must not be accessible to others, because they might have copied the key in it."""
     content = read(path, what)
     mode = path.stat().st_mode
-    if mode & _OTHERS:
+    if is_open_to_others(mode):
         raise UsageError(
             f"{what} {path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 600 it, and issue a new one if "
             "others may have read it"
@@ -299,15 +299,12 @@ def read_private(path: Path, what: str) -> bytes:
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
     """Lock a directory against changes by other processes. Waits for the lock, which ends with its process."""
+    if sys.platform == "win32":  # where directories can't be opened: lock a file in it instead
+        descriptor = os.open(directory / ".lock", os.O_RDWR | os.O_CREAT, 0o600)
+    else:
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        import fcntl
-    except ImportError:
-        raise UnsupportedError(
-            f"keys are made and revoked on Linux or macOS, but this is {sys.platform}; copy issued keys to this machine"
-        ) from None
-    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        lock_file(descriptor, None)
         yield
     finally:
         os.close(descriptor)

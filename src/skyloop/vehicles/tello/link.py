@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import socket
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Final
@@ -52,6 +53,8 @@ def _through(options: TelloOptions) -> socket.socket:
     made.setblocking(False)
     if options.interface is not None:
         try:
+            if sys.platform != "linux":
+                raise OSError(errno.ENOTSUP, "needs Linux; elsewhere, give local=ADDRESS")
             made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, options.interface.encode() + b"\0")
         except OSError as error:
             made.close()

@@ -17,9 +17,9 @@ from skyloop.drivers.live_camera import intrinsics_of
 from skyloop.drivers.live_video import Coded, Decoded
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
-from skyloop.files import wait_readable
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.messages.frame import H264
+from skyloop.platform import wait_readable
 from skyloop.pyav import new_decoder, require_pyav
 from skyloop.vehicles.tello.link import receiving_socket
 from skyloop.vehicles.tello.options import TelloOptions

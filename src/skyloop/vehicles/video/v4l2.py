@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -111,9 +112,11 @@ class V4l2Device:
 
     def __init__(self, descriptor: int, ioctl: Ioctl | None = None) -> None:
         if ioctl is None:
-            from fcntl import ioctl as kernels  # this module is not available on Windows
+            if sys.platform == "win32":
+                raise NotImplementedError
+            import fcntl
 
-            ioctl = kernels
+            ioctl = fcntl.ioctl
         self._descriptor = descriptor
         self._ioctl = ioctl
 
@@ -233,6 +236,8 @@ class V4l2Device:
 @contextmanager
 def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
     """Open a device such as ``/dev/video0`` to access its settings; ``ioctl`` is as in :class:`V4l2Device`."""
+    if sys.platform == "win32":
+        raise NotImplementedError
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
         yield V4l2Device(descriptor, ioctl)
@@ -309,6 +314,6 @@ def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(errors="replace").strip()
+        return path.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
         return ""

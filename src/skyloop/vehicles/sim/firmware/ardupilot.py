@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 from skyloop.errors import DecodeError
-from skyloop.files import wait_readable
+from skyloop.platform import wait_readable
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, Readings
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance

@@ -55,6 +55,8 @@ def raise_priority() -> None:
     Only Linux keeps a niceness for each thread. Calling :func:`restore_priority` equally often restores it.
     """
     global _prioritizers  # noqa: PLW0603
+    if sys.platform != "linux":
+        return
     with _priority_lock:
         _prioritizers += 1
         for thread in _threads() if _prioritizers == 1 else ():
@@ -67,6 +69,8 @@ def raise_priority() -> None:
 def restore_priority() -> None:
     """Restore the niceness from before :func:`raise_priority`; later threads get the highest saved value."""
     global _prioritizers  # noqa: PLW0603
+    if sys.platform != "linux":
+        return
     with _priority_lock:
         _prioritizers -= 1
         for thread in _threads() if _niceness and not _prioritizers else ():
@@ -77,11 +81,13 @@ def restore_priority() -> None:
 
 
 def _threads() -> list[int]:
-    return [int(task.name) for task in Path("/proc/self/task").iterdir()] if sys.platform == "linux" else []
+    return [int(task.name) for task in Path("/proc/self/task").iterdir()]
 
 
 def main(arguments: list[str]) -> int:
     """Run the firmware until it ends or standard input is closed; return the exit code."""
+    if sys.platform == "win32":  # the firmware's programs are for Linux, and perhaps macOS
+        raise NotImplementedError
     cut = arguments.index("--")
     folder, log, *settings = arguments[:cut]
     prompt = PROMPT in settings

@@ -123,6 +123,8 @@ class Apart:
 
     def receive_socket(self) -> socket.socket:
         """Return the newest keeper's UDP socket; the caller must close it. Raises OSError without a new socket."""
+        if sys.platform == "win32":
+            raise NotImplementedError
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:
@@ -139,6 +141,12 @@ class Apart:
             each.close()
 
 
+def _hand_over(through: socket.socket, made: socket.socket) -> None:
+    if sys.platform == "win32":
+        raise NotImplementedError
+    socket.send_fds(through, [b"."], [made.fileno()])
+
+
 class Relay:
     """The keeper's end. Create it while the process has only one thread: the process leaves the computer's network.
 
@@ -150,7 +158,7 @@ class Relay:
         self._listener = socket.socket(fileno=listener)
         leave_network()
         with socket.socket(fileno=channel) as keepers, bound(socket.SOCK_DGRAM, udp_port) as made:
-            socket.send_fds(keepers, [b"."], [made.fileno()])
+            _hand_over(keepers, made)
 
     def start(self) -> None:
         """Start the threads that relay bytes."""

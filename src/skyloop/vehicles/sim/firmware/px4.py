@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from skyloop.errors import UsageError
-from skyloop.files import wait_readable
 from skyloop.messages.geometry import in_16_bits
+from skyloop.platform import wait_readable
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, GpsFix, Readings, geodetic
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes

@@ -1,0 +1,264 @@
+"""What differs between Linux, macOS and Windows, for everything but the transport within one host.
+
+Each function has a side for each system. The sides for macOS and Windows follow their documentation, as the comments
+say, and have not been run on a real machine (``docs/platforms.md``); the tests run them on Linux with stand-ins.
+Modules that another system lacks are imported where they are used.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import math
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import IO, Any, Final, Protocol
+
+# learn.microsoft.com/windows/win32/procthread/process-creation-flags
+_CREATE_NEW_PROCESS_GROUP: Final = 0x00000200
+_CREATE_NO_WINDOW: Final = 0x08000000
+_BELOW_NORMAL_PRIORITY_CLASS: Final = 0x00004000
+#: learn.microsoft.com/windows/win32/api/processthreadsapi/nf-processthreadsapi-setthreadpriority
+_THREAD_PRIORITY_LOWEST: Final = -2
+_POLL_S: Final = 0.005  # how often to ask where the system can't wait
+_CHUNK: Final = 4096
+#: What POSIX terminals send for the keys that ``msvcrt.getwch`` reports with a prefix and a scan code: arrows.
+_WINDOWS_KEYS: Final = {"H": b"\x1b[A", "P": b"\x1b[B", "M": b"\x1b[C", "K": b"\x1b[D"}
+_NO_FUNCTION: Final = b"\x1b[99~"  # a key without a function here
+
+
+# Processes ------------------------------------------------------------------------------------------------------
+
+
+def own_session(inherited: Sequence[int] = ()) -> dict[str, Any]:
+    """Return options of ``subprocess.Popen`` for a child that Ctrl-C in the parent's terminal does not reach.
+
+    ``inherited``: file descriptors that the child inherits, on POSIX only. A Windows child is not put into a job that
+    ends with its parent: the proxy of a flying vehicle must outlive its program for as long as the landing takes.
+    """
+    if sys.platform != "win32":
+        return {"start_new_session": True, "pass_fds": tuple(inherited)}
+    # A new group disables Ctrl-C for the child (learn.microsoft.com/windows/console/generateconsolectrlevent, remarks);
+    # no window keeps a console from opening for each child of a program without one, such as a notebook's.
+    return {"creationflags": _CREATE_NEW_PROCESS_GROUP | _CREATE_NO_WINDOW}
+
+
+def end_session(process: subprocess.Popen[Any]) -> None:
+    """Terminate a child that was started with :func:`own_session`, and the children that it started."""
+    if sys.platform != "win32":
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGTERM)
+        return
+    # Windows has no process groups to signal; taskkill ends the tree of children (/t), which outlives its root.
+    subprocess.run(["taskkill", "/f", "/t", "/pid", str(process.pid)], capture_output=True, check=False)
+
+
+def read_tail(descriptor: int, most: int) -> bytes:
+    """Return the last bytes of a file that another process is writing, without moving that process's position."""
+    begin = max(0, os.fstat(descriptor).st_size - most)
+    if sys.platform != "win32":
+        return os.pread(descriptor, most, begin)
+    # An inherited handle shares its file position. Put back where the other process writes, at the end.
+    os.lseek(descriptor, begin, os.SEEK_SET)
+    try:
+        return os.read(descriptor, most)
+    finally:
+        os.lseek(descriptor, 0, os.SEEK_END)
+
+
+class Descriptor(Protocol):
+    """Anything with a file descriptor."""
+
+    def fileno(self) -> int: ...
+
+
+def wait_readable(source: Descriptor | int, within_s: float) -> bool:
+    """Wait until a descriptor is readable or closed; return False if neither happens within ``within_s`` [s].
+
+    Works for any descriptor number; ``select.select`` raises an error from 1,024 on. On Windows, for sockets only.
+    """
+    if sys.platform == "win32":
+        return bool(select.select([source], [], [], within_s)[0])
+    poll = select.poll()
+    poll.register(source, select.POLLIN)
+    return bool(poll.poll(math.ceil(within_s * 1000.0)))
+
+
+def read_within(pipe: IO[bytes], within_s: float) -> bytes | None:
+    """Wait for output of a child and return what there is; empty at its end, None if nothing comes in time [s]."""
+    descriptor = pipe.fileno()
+    if sys.platform != "win32":
+        return os.read(descriptor, _CHUNK) if wait_readable(descriptor, within_s) else None
+    import ctypes
+    import msvcrt
+
+    # Only sockets can be waited for with a time limit: ask how much a read would return, and whether the end is there.
+    # learn.microsoft.com/windows/win32/api/namedpipeapi/nf-namedpipeapi-peeknamedpipe, also for anonymous pipes
+    handle, there = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor)), ctypes.c_ulong()
+    peek = ctypes.WinDLL("kernel32").PeekNamedPipe
+    deadline_s = time.monotonic() + within_s
+    while peek(handle, None, 0, None, ctypes.byref(there), None) and not there.value:
+        if time.monotonic() >= deadline_s:
+            return None
+        time.sleep(_POLL_S)
+    return os.read(descriptor, _CHUNK)
+
+
+def usable_cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def lower_priority(niceness: int, *, thread_only: bool = False) -> None:
+    """Lower the priority of this process, or of the calling thread alone, so that flying takes precedence.
+
+    ``niceness``: on Linux and macOS. On Linux it applies to the calling thread and the threads that it starts later, on
+    macOS to the whole process; there, ``thread_only`` does nothing. Windows has priority classes instead.
+    """
+    if sys.platform != "win32":
+        if sys.platform == "linux" or not thread_only:
+            os.nice(niceness)
+        return
+    import ctypes
+
+    kernel32 = ctypes.WinDLL("kernel32")
+    if thread_only:
+        kernel32.SetThreadPriority(kernel32.GetCurrentThread(), _THREAD_PRIORITY_LOWEST)
+    else:
+        kernel32.SetPriorityClass(kernel32.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
+
+
+def on_signals(numbers: Sequence[int], call: Callable[[], object]) -> None:
+    """Call a function on the running event loop when a signal arrives. Main thread only.
+
+    The event loops of Windows have no ``add_signal_handler``. Ctrl-C and Ctrl-Break arrive there as SIGINT and
+    SIGBREAK, and ``TerminateProcess`` ends a process without any signal.
+    """
+    loop = asyncio.get_running_loop()
+    if sys.platform != "win32":
+        for number in numbers:
+            loop.add_signal_handler(number, call)
+        return
+    for number in (*numbers, getattr(signal, "SIGBREAK", signal.SIGINT)):
+        signal.signal(number, lambda *_: loop.call_soon_threadsafe(call))
+
+
+def sees_peers() -> bool:
+    """Return whether this system tells a server which user's program is at the other end of a loopback connection."""
+    return sys.platform == "linux"
+
+
+# Files ----------------------------------------------------------------------------------------------------------
+
+
+def lock_file(descriptor: int, timeout_s: float | None) -> bool:
+    """Lock an open file against other processes until it is closed, or its process ends in whatever way.
+
+    ``timeout_s``: how long to wait for another process [s]; None for as long as necessary. Return False after that.
+    """
+    deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+    while not _locked_now(descriptor):
+        if deadline_s is not None and time.monotonic() > deadline_s:
+            return False
+        time.sleep(_POLL_S)
+    return True
+
+
+def _locked_now(descriptor: int) -> bool:
+    try:
+        if sys.platform != "win32":
+            import fcntl
+
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        else:
+            import msvcrt
+
+            # One byte, beyond the end of any file that is locked, so that the lock keeps no one from reading.
+            os.lseek(descriptor, 1 << 30, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    except OSError as error:
+        if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
+            raise
+        return False
+    return True
+
+
+def is_own_user(user: int | None, *, or_root: bool = False) -> bool:
+    """Return whether a user id is this process's own. Windows has no such ids: there, no one is anyone."""
+    return sys.platform != "win32" and (user == os.geteuid() or (or_root and user == 0))
+
+
+def is_open_to_others(mode: int) -> bool:
+    """Return whether a file's mode gives access to its group or to others. False on Windows, whose modes say nothing.
+
+    Files in a Windows user's profile are closed to other users by the access list that they inherit from it.
+    """
+    return sys.platform != "win32" and bool(mode & 0o077)
+
+
+# Terminals ------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
+    """Let a terminal report single keys in the block, without Enter, and restore it afterwards. Main thread only.
+
+    Yields a function that waits for keys for at most so many seconds and returns their bytes as POSIX terminals send
+    them, None if there were none, or nothing if the terminal has been closed. Ctrl-C still interrupts; Ctrl-Z does not
+    suspend a flight, and Ctrl-S has no effect.
+    """
+    if sys.platform == "win32":
+        yield _console_keys
+        return
+    import termios
+    import tty
+
+    before = termios.tcgetattr(terminal)
+
+    def set_mode(*_: object) -> None:
+        tty.setcbreak(terminal, termios.TCSANOW)
+        mode = termios.tcgetattr(terminal)
+        mode[0] &= ~termios.IXON
+        for name in ("VSUSP", "VDSUSP"):
+            if hasattr(termios, name):
+                mode[6][getattr(termios, name)] = bytes((os.fpathconf(terminal, "PC_VDISABLE"),))
+        termios.tcsetattr(terminal, termios.TCSANOW, mode)
+
+    def keys(within_s: float) -> bytes | None:
+        return os.read(terminal, 1024) if wait_readable(terminal, within_s) else None
+
+    set_mode()
+    continued = signal.signal(signal.SIGCONT, set_mode)  # a shell may have set its own mode during a suspension
+    try:
+        yield keys
+    finally:
+        signal.signal(signal.SIGCONT, continued)
+        termios.tcsetattr(terminal, termios.TCSANOW, before)
+
+
+def _console_keys(within_s: float) -> bytes | None:
+    """Wait for keys in a console of Windows.
+
+    ``msvcrt`` does not report Ctrl-C, which interrupts the program as usual. Arrow and function keys come as two
+    characters, of which the first is NUL or U+00E0 (docs.python.org/3/library/msvcrt.html); only arrows mean something.
+    """
+    if sys.platform != "win32":
+        raise NotImplementedError
+    import msvcrt
+
+    deadline_s = time.monotonic() + within_s
+    while not msvcrt.kbhit():
+        if time.monotonic() >= deadline_s:
+            return None
+        time.sleep(_POLL_S)
+    keys = b""
+    while msvcrt.kbhit():
+        key = msvcrt.getwch()
+        keys += _WINDOWS_KEYS.get(msvcrt.getwch(), _NO_FUNCTION) if key in "\0\xe0" else key.encode()
+    return keys

@@ -1,0 +1,188 @@
+"""The sides of :mod:`skyloop.platform` for other systems, run here with stand-ins for what those systems have."""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skyloop import platform
+from skyloop.child_process import ChildProcess
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="compares the sides of Linux and Windows")
+
+
+@pytest.fixture
+def windows(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Become Windows, with these names in ``msvcrt`` and these functions in ``kernel32``."""
+
+    def become(msvcrt: dict[str, Any] | None = None, **kernel32: Callable[..., Any]) -> None:
+        monkeypatch.setitem(sys.modules, "msvcrt", types.SimpleNamespace(**(msvcrt or {})))
+        library = types.SimpleNamespace(**kernel32)
+        monkeypatch.setattr(ctypes, "WinDLL", lambda name: {"kernel32": library}[name], raising=False)
+        monkeypatch.setattr(sys, "platform", "win32")
+
+    return become
+
+
+def test_ctrl_c_reaches_no_child(windows: Callable[..., None]) -> None:
+    assert platform.own_session((7,)) == {"start_new_session": True, "pass_fds": (7,)}
+    windows()
+    flags = platform.own_session()["creationflags"]
+    assert flags & 0x200, "a group of its own"
+    assert flags & 0x08000000, "no window"
+
+
+def test_a_session_is_ended_with_its_children(windows: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'print(1, flush=True); input()'])"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, **platform.own_session()
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    with child.stdin, child.stdout:
+        assert child.stdout.readline() == b"1\n"
+        platform.end_session(child)
+        assert child.stdout.read() == b"", "the grandchild, which had the same output, has ended, too"
+        child.wait()
+    platform.end_session(child)
+
+    windows()
+    ran: list[list[str]] = []
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: ran.append(command))
+    platform.end_session(child)
+    assert ran == [["taskkill", "/f", "/t", "/pid", str(child.pid)]]
+
+
+@pytest.mark.parametrize("system", ["here", "windows"])
+def test_the_tail_of_a_file_leaves_its_writers_position_alone(
+    system: str, windows: Callable[..., None], tmp_path: Path
+) -> None:
+    with (tmp_path / "errors").open("w+b", buffering=0) as file:
+        file.write(b"0123456789")
+        if system == "windows":
+            windows()
+        assert platform.read_tail(file.fileno(), 4) == b"6789"
+        assert platform.read_tail(file.fileno(), 40) == b"0123456789"
+        file.write(b"x")
+        assert platform.read_tail(file.fileno(), 4) == b"789x"
+
+
+def test_output_of_a_child_is_waited_for() -> None:
+    child = ChildProcess([sys.executable, "-c", "print('a', flush=True); input()"])
+    try:
+        assert platform.read_within(child.stdout, 30.0) == b"a\n"
+        assert platform.read_within(child.stdout, 0.0) is None
+        child.part()
+        assert platform.read_within(child.stdout, 30.0) == b""
+    finally:
+        child.close()
+
+
+def test_output_of_a_child_is_waited_for_on_windows(windows: Callable[..., None]) -> None:
+    reader, writer = os.pipe()
+    asked: list[int] = []
+    with os.fdopen(reader, "rb", buffering=0) as pipe:
+
+        def peek(handle: Any, _buffer: None, _size: int, _read: None, there: Any, _left: None) -> int:
+            assert handle.value == reader + 1000
+            asked.append(1)
+            if len(asked) == 3:
+                os.write(writer, b"ready")
+            there._obj.value = 5 if len(asked) == 3 else 0
+            return len(asked) < 6  # fails once the other end is closed
+
+        windows({"get_osfhandle": lambda descriptor: descriptor + 1000}, PeekNamedPipe=peek)
+        assert platform.read_within(pipe, 10.0) == b"ready"
+        assert platform.read_within(pipe, 0.0) is None
+        os.close(writer)
+        assert platform.read_within(pipe, 10.0) == b""
+
+
+def test_priorities(windows: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[tuple[object, ...]] = []
+    monkeypatch.setattr(os, "nice", lambda by: done.append(("nice", by)))
+    platform.lower_priority(10, thread_only=True)
+    monkeypatch.setattr(sys, "platform", "darwin")
+    platform.lower_priority(10, thread_only=True)  # would slow the whole process
+    platform.lower_priority(5)
+    windows(
+        GetCurrentThread=lambda: "thread",
+        GetCurrentProcess=lambda: "process",
+        SetThreadPriority=lambda *given: done.append(given),
+        SetPriorityClass=lambda *given: done.append(given),
+    )
+    platform.lower_priority(10, thread_only=True)
+    platform.lower_priority(10)
+    assert done == [("nice", 10), ("nice", 5), ("thread", -2), ("process", 0x4000)]
+
+
+@pytest.mark.parametrize("system", ["here", "windows"])
+def test_a_signal_reaches_the_event_loop(system: str, windows: Callable[..., None]) -> None:
+    async def run() -> None:
+        ending = asyncio.Event()
+        if system == "windows":
+            windows()
+        platform.on_signals([signal.SIGUSR1], ending.set)
+        signal.raise_signal(signal.SIGUSR1)
+        await asyncio.wait_for(ending.wait(), 10.0)
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGUSR1, signal.SIGINT)}
+    try:
+        asyncio.run(run())
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_a_lock_ends_with_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "lock"
+    with path.open("wb") as first, path.open("wb") as second:
+        assert platform.lock_file(first.fileno(), 0.0)
+        assert not platform.lock_file(second.fileno(), 0.0)
+        first.close()
+        assert platform.lock_file(second.fileno(), None)
+
+
+def test_a_lock_of_windows(windows: Callable[..., None], tmp_path: Path) -> None:
+    answers: list[BaseException | None] = [PermissionError(13, "denied"), None, OSError(9, "bad file"), None]
+    asked: list[tuple[int, ...]] = []
+
+    def locking(*given: int) -> None:
+        asked.append(given)
+        answer = answers.pop(0)
+        if answer is not None:
+            raise answer
+
+    with (tmp_path / "lock").open("wb") as file:
+        number = file.fileno()
+        windows({"locking": locking, "LK_NBLCK": 2})
+        assert not platform.lock_file(number, -1.0)
+        assert platform.lock_file(number, None)
+        with pytest.raises(OSError, match="bad file"):
+            platform.lock_file(number, None)
+        assert asked == [(number, 2, 1)] * 3
+
+
+def test_modes_of_files_say_nothing_on_windows(windows: Callable[..., None]) -> None:
+    assert platform.is_open_to_others(0o640)
+    assert not platform.is_open_to_others(0o100600)
+    windows()
+    assert not platform.is_open_to_others(0o666)
+
+
+def test_keys_of_a_windows_console(windows: Callable[..., None]) -> None:
+    typed = ["w", "\xe0", "H", "\x1b", "\0", ";"]  # w, up, Esc, F1
+    windows({"kbhit": lambda: bool(typed), "getwch": lambda: typed.pop(0)})
+    with platform.single_keys(0) as keys:
+        assert keys(1.0) == b"w\x1b[A\x1b\x1b[99~"
+        assert keys(0.0) is None
