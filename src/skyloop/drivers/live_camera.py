@@ -31,7 +31,10 @@ if TYPE_CHECKING:
 STALLED_S: Final = 1.5  #: time without data, or three frame periods if longer, after which a stream is reopened
 _WHERE: Final = "camera"  # source of the camera's events
 OPEN_S: Final = 5.0  #: time limit for the connection, the handshake and the first frame
-DEVICE_FORMAT: Final = "v4l2"
+V4L2: Final = "v4l2"
+#: FFmpeg's input formats for cameras of macOS and Windows, and how each names a camera without a microphone
+#: (ffmpeg.org/ffmpeg-devices.html). They are written like schemes: ``dshow://Integrated Camera``, ``avfoundation://0``.
+OTHER_DEVICES: Final = {"avfoundation": "{}:none", "dshow": "video={}"}
 RTP_PORT: Final = 5600  #: default port of PX4, ArduPilot's companion computers and QGroundControl
 _PAYLOAD: Final = 96  # GStreamer's default payload type for rtph264pay and rtph265pay
 _RTP_OPTIONS: Final = frozenset({"payload", "codec"})
@@ -61,6 +64,7 @@ class CameraSource:
     sdp: str = ""  #: session description (RFC 4566), if no server provides it
     fallback: Mapping[str, str] | None = None  #: options for a retry if the server refuses the first protocol
     loses: bool = False  #: whether parts of frames can be lost unnoticed
+    device: str = V4L2  #: FFmpeg's input format for a device
 
     @property
     def host(self) -> str | None:
@@ -81,9 +85,13 @@ def source_of(text: str, where: str) -> CameraSource:
     scheme, separator, _ = text.partition("://")
     if not separator and Path(text).is_relative_to("/dev"):
         return CameraSource(text, "")
+    if scheme in OTHER_DEVICES and text != f"{scheme}://":
+        return CameraSource(OTHER_DEVICES[scheme].format(text.partition("://")[2]), "", device=scheme)
     if not separator or scheme not in _WAYS:
         ways = ", ".join(f"{way}://…" for way in _WAYS)
-        raise UsageError(f"{where} is {without_secrets(text)!r} and must be one of {ways} or a device /dev/video…")
+        raise UsageError(
+            f"{where} is {without_secrets(text)!r} and must be one of {ways} or a device: /dev/video…, dshow://NAME, avfoundation://NAME"
+        )
     try:
         parts = urlsplit(text)
         named = parts.port != 0 and (bool(parts.hostname) or scheme in _LISTENING)
@@ -277,13 +285,13 @@ class LiveCamera:
 
     def _open_device(self, open_stream: Callable[..., ContainerStream]) -> ContainerStream:
         settings = self._settings
-        path = settings.source.name
-        if not Path(path).exists():
+        path, device = settings.source.name, settings.source.device
+        if device == V4L2 and not Path(path).exists():
             raise FileNotFoundError(self._absent())
         size = f"{settings.width}x{settings.height}"
         options = {"video_size": size, "framerate": f"{settings.fps:g}", **settings.device_options}
-        stream = open_stream(path, format_name=DEVICE_FORMAT, options=options)
-        for problem in [] if self._configure is None else self._configure(path):
+        stream = open_stream(path, format_name=device, options=options)
+        for problem in self._configure(path) if self._configure is not None and device == V4L2 else []:
             if problem not in self._reported:
                 self._reported.append(problem)
                 self._report(problem)

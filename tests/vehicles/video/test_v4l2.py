@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from skyloop.drivers.live_camera import source_of
+from skyloop.errors import UsageError
 from skyloop.vehicles.video import v4l2
 from skyloop.vehicles.video.driver import DeviceOptions
 from skyloop.vehicles.video.v4l2 import CameraDevice, FrameSize, PixelFormat, V4l2Device, listed
@@ -185,3 +187,27 @@ def test_a_listing_of_an_unreadable_camera_says_why(webcam: Webcam, tmp_path: Pa
     assert listed(device)[1] == f"  can't be opened: {os.strerror(errno.ENOTTY)}"
     webcam.capabilities = 0, 0
     assert listed(device, lambda _descriptor, *asked: webcam(7, *asked))[1] == "  captures no images"
+
+
+def test_cameras_of_other_systems_are_listed_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With what PyAV returns there (its documentation), because FFmpeg for Linux has no such devices."""
+    device = pytest.importorskip("av.device", reason="PyAV 17 or later lists devices")
+    asked: list[str] = []
+
+    def enumerate_input_devices(name: str) -> list[object]:
+        asked.append(name)
+        both = {"Integrated Camera": "video", "Microphone": "audio"}
+        return [device.DeviceInfo(name, f"{name} (USB)", False, [kind]) for name, kind in both.items()]
+
+    monkeypatch.setattr(device, "enumerate_input_devices", enumerate_input_devices)
+    monkeypatch.setattr("sys.platform", "win32")
+    (camera,) = v4l2.cameras()
+    assert asked == ["dshow"]
+    assert listed(camera) == ["video://dshow://Integrated Camera (Integrated Camera (USB))"]
+    source = source_of(str(camera.path), "video://")
+    assert (source.name, source.device, source.scheme) == ("video=Integrated Camera", "dshow", "")
+    monkeypatch.undo()
+    assert v4l2.other_cameras("avfoundation") == [], "this FFmpeg has no such devices"
+    assert source_of("avfoundation://0", "video://").name == "0:none"
+    with pytest.raises(UsageError, match="dshow://NAME"):
+        source_of("dshow://", "video://")

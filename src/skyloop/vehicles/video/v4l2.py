@@ -261,13 +261,14 @@ def _reason(error: OSError) -> str:
 
 _CLASS: Final = Path("/sys/class/video4linux")
 _DEVICES: Final = Path("/dev")
+_OTHER_SYSTEMS: Final = {"darwin": "avfoundation", "win32": "dshow"}
 
 
 @dataclass(frozen=True, slots=True)
 class CameraDevice:
     """A local camera."""
 
-    path: Path  #: path such as ``/dev/video0``
+    path: Path | str  #: path such as ``/dev/video0``; elsewhere than on Linux, such as ``dshow://Integrated Camera``
     name: str  #: the device's name as reported by the driver
     allowed: bool  #: whether this user is allowed to open the device
 
@@ -276,11 +277,30 @@ class CameraDevice:
         return f"video://{self.path} ({self.name}){why}"
 
 
+def other_cameras(device: str) -> list[CameraDevice]:
+    """Return the cameras that FFmpeg lists for an input format of macOS or Windows; none if PyAV can't list them."""
+    try:
+        from av.device import enumerate_input_devices  # PyAV 17 or later
+    except ImportError:
+        return []
+    try:
+        found = enumerate_input_devices(device)
+    except (ValueError, OSError):  # this build of FFmpeg has no such devices
+        return []
+    return [
+        CameraDevice(f"{device}://{camera.name}", camera.description, allowed=True)
+        for camera in found
+        if "video" in camera.media_types
+    ]
+
+
 def cameras(system: Path = _CLASS, devices: Path = _DEVICES) -> list[CameraDevice]:
     """Return the local cameras in order of their numbers; an empty list if the system has no Video4Linux.
 
     Only the first node of each camera is listed; that node captures images.
     """
+    if (device := _OTHER_SYSTEMS.get(sys.platform)) is not None:
+        return other_cameras(device)
     try:
         nodes = sorted(system.iterdir(), key=lambda node: (len(node.name), node.name))
     except OSError:
@@ -303,6 +323,8 @@ def described(found: list[CameraDevice]) -> str:
 
 def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
     """Return a readable description of a camera, line by line: address, formats, sizes, rates, exposure and gain."""
+    if isinstance(camera.path, str):
+        return [str(camera)]
     try:
         with opened(str(camera.path), ioctl) as device:
             told = [*map(str, device.formats()), *device.settings()]
