@@ -344,7 +344,7 @@ def test_another_size_is_shown_and_forwarded_from_its_key_picture_on() -> None:
         ("rtp://:5600?speed=2", "options codec and payload, got speed"),
         ("rtp://:0", "names no host"),
         ("ftp://here/there", "must be one of rtsp://…, rtp://…"),
-        ("clip.mp4", "or a device /dev/video…"),
+        ("clip.mp4", "or a device: /dev/video…"),
     ],
 )
 def test_bad_addresses_are_refused(address: str, message: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Iterable
 from enum import StrEnum
@@ -18,6 +19,7 @@ from skyloop.recording.layout import Channel
 
 VideoEncoding = Literal["auto", "jpeg", "png"]
 
+_FORBIDDEN: Final = re.compile(r'[<>:"/\\|?*]')  # in the names of files; Windows has the longest list
 MB: Final = 1_000_000
 VIDEO: Final = "video"
 #: Channels to choose from; ``video.CAMERA`` selects one camera.
@@ -110,7 +112,7 @@ def first_path(path: Path, drones: list[str], options: Options) -> Path:
     Raise ``UsageError`` if the file already exists or its folder does not.
     """
     if path.is_dir():
-        path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+        path = path / f"{_FORBIDDEN.sub('_', '-'.join(drones)[:64])}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
     if not path.suffix:
         path = path.with_suffix(".mcap")
     if not path.parent.is_dir():
