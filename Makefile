@@ -26,26 +26,20 @@ help:
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
 	@echo "make format | stubs | coverage | pictures | lock | clean"
 
-# One stamp for what the demo needs and one for what the tests need besides; both are made again when the project changes.
+# `dev.py` sets up the environment, where there is no make as well; its stamps are made again when the project changes.
+export VENV LOCKED
 $(VENV)/.installed: pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Skyloop needs Python 3.11 or newer, this is " + sys.version.split()[0])'
-	@echo "Installing Skyloop into $(VENV): a minute or two, once"
-	@(while sleep 2; do printf .; done) & trap "kill $$!" EXIT; $(PYTHON) -m venv $(VENV)
-	@echo
-	$(PIP) --editable '.[sim,vision,cockpit]'
-	@touch $@
+	@$(PYTHON) dev.py install
 
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock
-	@echo "Installing what the tests and checks need besides: two minutes or three, once"
-	$(PIP) --editable '.[all]' --requirement requirements-dev.txt
-	@touch $@
+	@$(PYTHON) dev.py install dev
 
-demo: $(VENV)/.installed
-	@$(BIN)/skyloop demo $(ARGS)
+demo:
+	@$(PYTHON) dev.py demo $(ARGS)
 
-# Twice as many tests at a time as the machine has cores: most wait more than they compute. ARGS select from all tests.
-test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest --numprocesses $(shell $(PYTHON) -c 'import os; print(2 * (os.cpu_count() or 1))') $(or $(ARGS),-m "not slow" --durations 10 --durations-min 3)
+# The tests of every day; ARGS select from all tests.
+test:
+	@$(PYTHON) dev.py test $(ARGS)
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto $(ARGS)

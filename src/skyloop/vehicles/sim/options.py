@@ -34,6 +34,8 @@ TRUTH_HZ: Final = 100.0  #: rate at which the ground truth is stored alongside t
 
 def options_of(uri: VehicleUri) -> SimOptions:
     """Parse an address."""
+    if "process" in uri.options:
+        raise UsageError(f"{uri}: process=none is an option of skyloop.connect(), which removes it: leave it out here")
     autopilot = _autopilot(uri)
     if autopilot is None:
         reject_unknown_options(uri, KNOWN)
