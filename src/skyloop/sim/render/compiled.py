@@ -42,7 +42,7 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with the functions from ``kernels``. See :class:`Painter`."""
+    """Draws with the functions from ``kernels``."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
@@ -60,7 +60,6 @@ class CompiledPainter(Painter):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
         if self._fixed is None or self._fixed[0] is not quads.texture:  # these do not change while parts move
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
@@ -153,7 +152,7 @@ class Compiler:
             return self._thread
 
     def _hold(self, process: int) -> None:
-        """Block further compilation permanently: after a fork, neither the thread nor a usable lock exists."""
+        """Block further compilation permanently, unless this is a forked child, which has no usable lock."""
         if process == os.getpid():
             self._compiling.acquire()
 

@@ -63,7 +63,7 @@ class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
     :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so it must be used from one
-    thread at a time. Several renderers can share a scene. If there is no compiler, it never draws with compiled code.
+    thread at a time. Several renderers can share a scene. With ``compiler`` None, it never draws with compiled code.
     """
 
     def __init__(

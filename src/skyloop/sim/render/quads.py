@@ -39,7 +39,7 @@ class SceneState:
     light: float = 1.0
 
 
-LEVELS = 7
+LEVELS = 7  # sizes of each texture: the full one, and six that are each half as large
 BORDER = 4  # pixels repeated around each level, so that interpolation at the edge stays within the level
 GAP = 2 * BORDER
 _STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this step, so that every level can be halved exactly
@@ -57,7 +57,7 @@ class Texture:
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """All textures in one image."""
+    """All textures in one image. Level k of a texture starts at column x0 + span (1 - 2^-k) + GAP k."""
 
     image: NDArray[np.uint8]  #: the image in BGRA (OpenCV samples four channels twice as fast as three)
     x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)

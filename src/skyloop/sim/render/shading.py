@@ -204,7 +204,7 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     c = view.inverse_depth
     u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
     texture = quads.texture[k]
-    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0 (see ``Atlas``).
+    # a = (slope in optical axes) + (texel under the eye, less the span) c, because levels shift as ``Atlas`` explains.
     under_u = dot(u_slope, pose.position_m) + quads.u_start[k] - atlas.span[texture]
     under_v = dot(v_slope, pose.position_m) + quads.v_start[k]
     table = np.zeros((13, len(k) + 1))
@@ -310,10 +310,9 @@ class Shader:
         cv2.multiply(colours, light4, dst=colours, scale=1.0 / UNIT)
 
 
-# Maximum distance of a pixel from a shadow's plane at which the shadow darkens it, as a fraction of the pixel's depth.
-_THICKNESS = 4e-3
-_MORE_M = 4e-3
-_NEAR_M = 0.01
+# A pixel is darkened if its distance from the shadow's plane is below this fraction of its depth, plus this constant.
+_THICKNESS, _MORE_M = 4e-3, 4e-3
+_NEAR_M = 0.01  # corners of a shadow closer to the camera's plane than this are cut off
 
 
 @dataclass(frozen=True, slots=True)
