@@ -219,7 +219,7 @@ def test_mismatched_arguments_are_refused(scene: Scene) -> None:
         renderer.render(state_at([(0.0, 0.0, 1.0)]), pose, PLAIN)
     with pytest.raises(UsageError, match="moving targets"):
         renderer.render(replace(state, targets=()), pose, PLAIN)
-    with pytest.raises(UsageError, match="folds"):
+    with pytest.raises(UsageError, match="no inverse"):
         renderer.render(state, pose, replace(PLAIN, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0)))
 
 

@@ -95,15 +95,15 @@ class Collisions:
         if np.count_nonzero(self._on_floor):
             contacts = Contacts()
             self._meet_floor(self._on_floor.nonzero()[0], contacts)
-        looked = step >= self._next
-        if looked:
+        refreshed = step >= self._next
+        if refreshed:
             self._run_broad_phase(step)
         elif self._near.moving:
             self._solids.move((step + 1) * STEP_S)
         if len(self._near.one) or self._near.solids:
             contacts = contacts or Contacts()
             self._narrow(step, contacts)
-        if looked or self._near.solids:
+        if refreshed or self._near.solids:
             np.copyto(self._free, self._bodies.position)
         return contacts
 
@@ -318,7 +318,6 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one might leave the broad phase's reach in the time left."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -368,5 +367,5 @@ def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, 
 
 
 def _span(acceleration_m_s2: float, steps: int) -> float:
-    """Return the maximum distance that a drone covers from rest in a number of steps [m]."""
+    """Return the maximum distance [m] that a drone can cover from rest in this many steps."""
     return acceleration_m_s2 * STEP_S * STEP_S * steps * (steps + 1) / 2

@@ -212,17 +212,14 @@ class Bodies(BodyTable):
         return [(tuple(one), tuple(other)) for one, other in zip(*rows, strict=True)]
 
     def cut(self, drone: int) -> None:
-        """Stop the motors, so that nothing holds the attitude."""
         self._stiff[:, drone] = 0.0
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, with the motors running or the legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Change a body's turn rate about the vertical."""
         self.rates[2, drone] += change_rad_s
         self.angles[2, drone] += change_rad_s * STEP_S
 
@@ -232,15 +229,10 @@ class Bodies(BodyTable):
         return power
 
     def step(self) -> None:
-        """Advance by :data:`STEP_S`, without collisions."""
-        if self._few:
-            self._step_each()
-        else:
+        if not self._few:
             self._turn()
             self._move()
-
-    def _step_each(self) -> None:
-        """Do the work of :meth:`_turn` and :meth:`_move` for one drone at a time."""
+            return
         for drone, (constants, _) in self._each:
             self._turn_one(drone, *constants)
         np.sin(self.angles, out=self.sin)
@@ -248,7 +240,7 @@ class Bodies(BodyTable):
         for drone, (_, constants) in self._each:
             self._move_one(drone, *constants)
 
-    def _turn_one(
+    def _turn_one(  # like _turn
         self, drone: int, damp: float, damp_yaw: float, most: float, most_yaw: float, airspeed_tilt: float
     ) -> None:
         roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read[drone]()
@@ -269,7 +261,7 @@ class Bodies(BodyTable):
         self._turned.write[drone](roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
 
     def _tilt_one(self, drone: int, airspeed_tilt: float) -> tuple[float, float]:
-        """Do the work of :meth:`_tilt_by_airspeed` for one drone."""
+        """Compute :meth:`_tilt_by_airspeed` for one drone."""
         *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read[drone]()
         east, north = vx - air_x, vy - air_y
         speed = math.sqrt(east * east + north * north)
@@ -277,7 +269,7 @@ class Bodies(BodyTable):
         tilt = airspeed_tilt * (slowed * slowed / max(speed, 1e-9))
         return (cos_yaw * north - sin_yaw * east) * tilt, -(cos_yaw * east + sin_yaw * north) * tilt
 
-    def _move_one(
+    def _move_one(  # like _move
         self,
         drone: int,
         motor_share: float,

@@ -68,7 +68,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held while stepping, as a thread that is ending may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; always replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
@@ -82,8 +82,8 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread. A
-        drone has one observer: for a second one this raises UsageError.
+        Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread.
+        Raises UsageError if there is no such drone, or it already has an observer.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -97,9 +97,9 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; do nothing if a different observer is attached. The last one stops the world.
+        """Stop reporting to an observer, or do nothing if a different one is attached. No report is running afterwards.
 
-        No report is running when this returns.
+        The world stops when its last observer is detached.
         """
         with self._lock:
             entry = self.observers.get(drone)
@@ -138,7 +138,7 @@ class Stepper(Protocol):
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Wait for the current round of reports. After this call, no frames from these cameras are delivered."""
+        """Stop delivering frames from these cameras, after the current round of reports has ended."""
 
 
 class ReportPublisher:

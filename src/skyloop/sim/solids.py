@@ -72,8 +72,7 @@ class Solids:
         """Return bounding boxes, low and high, each (3, boxes) [m]. The bounds are valid until the next call.
 
         Moving solids stay within their boxes for ``seconds``, and a hull of ``radius_m`` touches a solid only if their
-        bounding boxes overlap. (To find the distance between a hull and a corner of a turned box, treat the hull as a
-        square turned the same way.)
+        bounding boxes overlap.
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -86,6 +85,7 @@ class Solids:
         """Compute the bounding boxes of the given solids, enlarged by this reach on all sides."""
         c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
         x, y, z = self._half[:, which]
+        # For :meth:`overlap`, a hull is a square turned like the box, so it reaches further at the corners.
         corner = (c + s - 1.0) * self._bounded_m + reach_m
         around = np.array([c * x + s * y + corner, s * x + c * y + corner, z + reach_m])
         low, high = self._bounds
@@ -163,10 +163,9 @@ class Solids:
         if self._movers:
             self.move(time_s)
         nearest = math.inf
-        bounds = zip(
-            point, direction, (*self._room[:2], self._room[2]), (-self._room[0], -self._room[1], 0.0), strict=True
-        )
-        for axis, (start, way, high, low) in enumerate(bounds):
+        wide, deep, _ = self._room
+        bounds = zip(point, direction, (-wide, -deep, 0.0), self._room, strict=True)
+        for axis, (start, way, low, high) in enumerate(bounds):
             if way < 0.0 and (axis == 2 or self._enclosed):
                 nearest = min(nearest, max(0.0, (low - start) / way))
             elif way > 0.0 and self._enclosed:
