@@ -88,12 +88,13 @@ def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
             resource.setrlimit(kind, (limit, limit))
     try:
         run = _tracker(tracker, files) if tracker else _network(files[0])
-    except Exception as error:  # noqa: BLE001 raised again in the parent
+    except Exception as error:  # noqa: BLE001 the parent raises it
         print(reason(error))
         sys.exit(_REFUSED)
     try:
         run()
     except Exception as error:
+        # The shapes of the zeros are partly guessed, so only an error about memory says anything about the network.
         if isinstance(error, MemoryError) or "alloc" in str(error).lower():
             raise
 
@@ -137,4 +138,5 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return an exception's text, shortened and on one line."""
-    return " ".join(str(error).split())[:300]  # OpenCV keeps `err` on the class; it holds the last error anywhere
+    # OpenCV's error.err is no alternative: it is on the class, and holds the last error raised anywhere.
+    return " ".join(str(error).split())[:300]

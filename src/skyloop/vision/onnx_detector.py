@@ -133,16 +133,9 @@ def class_count(layout: Layout, outputs: Outputs) -> int | None:
 
 
 def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
-    """Decode a network's outputs into boxes, scores and classes. Rows with non-finite values pass unchanged.
+    """Decode a network's outputs, given the size of its input [px]. Rows with non-finite values pass unchanged.
 
-    Args:
-        layout: Layout of the outputs.
-        outputs: Outputs by name.
-        width: Width of the network's input [px].
-        height: Height of the network's input [px].
-
-    Raises:
-        FileFormatError: The shapes of the outputs don't match the layout.
+    Raises FileFormatError if the outputs' shapes don't match the layout.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # hostile numbers become infinite and are dropped later
         if layout is Layout.LISTS:
@@ -301,7 +294,7 @@ def _decoded(rows: Floats, width: int, height: int) -> bool:
 
 
 def layout_named(name: str | Layout | None) -> Layout | None:
-    """Check a layout's name."""
+    """Return the layout with this name; raise UsageError if there is none."""
     if name is None:
         return None
     try:
@@ -478,7 +471,7 @@ class OnnxDetector:
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
             raise FileFormatError(
-                f"{self._path} has the input {shown} and must have (1, 3, height, width) of float, float16 or uint8"
+                f"{self._path} has the input {shown}; it must be (1, 3, height, width), of type float, float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
             raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for batches of 1")
