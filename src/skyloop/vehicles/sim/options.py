@@ -33,7 +33,7 @@ TRUTH_HZ: Final = 100.0  #: rate at which the ground truth is stored alongside t
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
-    """Parse an address."""
+    """Parse an address; raise UsageError if an option is unknown, invalid or does not fit the others."""
     autopilot = _autopilot(uri)
     if autopilot is None:
         reject_unknown_options(uri, KNOWN)

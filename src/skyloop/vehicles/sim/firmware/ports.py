@@ -89,15 +89,15 @@ def release_instance(firmware: str, instance: int) -> None:
         _reserved.discard((firmware, instance))
 
 
-OPTION: Final = "--apart="
-CONNECT_S: Final = 1.0
-MAX_READ: Final = 65536
+OPTION: Final = "--network="
+CONNECT_S: Final = 1.0  #: time-out for a connection to the firmware, which is on the same computer
+MAX_READ: Final = 65536  #: bytes per read
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
 _SIOCSIFFLAGS: Final = 0x8914  # linux/sockios.h
 _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 
 
-class Apart:
+class SeparateNetwork:
     """The parent's side of the connection to firmware in a separate network.
 
     ``port`` is the TCP port on this computer that is forwarded to the firmware's TCP port.
