@@ -289,6 +289,7 @@ class Autopilot:
 
     def _start(self, drone: int, before: FlightState) -> None:
         limits, altitude = self.limits[drone], float(self._sensors.altitude[drone])
+        # A drone may start from a platform. In the air, what is below it is unknown, so take the floor.
         ground = altitude if before is FlightState.LANDED else 0.0
         height = min(ground + limits.takeoff_altitude_m, max(limits.altitude_m, altitude))
         self._rising[drone] = height

@@ -138,7 +138,8 @@ class CameraModel:
             height=round(self.height * factor),
             fx=self.fx * factor,
             fy=self.fy * factor,
-            cx=(self.cx + 0.5) * factor - 0.5,
+            cx=(self.cx + 0.5) * factor
+            - 0.5,  # the image's edge, half a pixel from the first centre, stays at the edge
             cy=(self.cy + 0.5) * factor - 0.5,
         )
 

@@ -37,8 +37,7 @@ class Shutter:
     """Decides when a camera exposes, using absolute simulation times. Pure."""
 
     def __init__(self, offset_s: float = 0.0) -> None:
-        """Set the time of the first exposure [s]."""
-        self._next_s = offset_s
+        self._next_s = offset_s  # time of the first exposure
         self.count = 0  #: number of exposures so far, including those that were not rendered
 
     def due(self, now_s: float, fps: float) -> bool:

@@ -305,7 +305,6 @@ class Collisions:
         return strayed
 
     def _close_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of overlapping drones."""
         near, position = self._near, self._bodies.position
         apart = position.take(near.one, axis=1) - position.take(near.other, axis=1)
         np.multiply(apart, apart, out=apart)

@@ -36,7 +36,7 @@ def columns(rows: int, drones: int) -> Floats:
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns`; for a few drones, as plain floats."""
+    """Plain floats in consecutive rows of an array made by :func:`columns` for a few drones."""
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
         rows, drones = table.shape

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
     from skyloop.sim.camera_pipeline import Camera, Pipeline, Screen
 
-TICK_S: Final = 0.008  #: simulated time per batch of steps
+TICK_S: Final = 0.008  #: time between batches of steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,34 +210,28 @@ class _RealTimeStepper:
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
         if self._thread is not threading.current_thread():
-            with self._publishing:
+            with self._publishing:  # waits for the current round of reports
                 pass
         if self._publisher.pipeline is not None:
             self._publisher.pipeline.forget(cameras)
 
     def _run(self) -> None:
+        options, simulation = self._host.options, self._simulation
         with self._host.stepping:
-            self._step_on()
-
-    def _step_on(self) -> None:
-        options = self._host.options
-        self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
-        self._slowness = SlownessWatch(monotonic_ns())
-        self._begun_s = self._simulation.time_s
-        try:
+            pacer = Pacer(simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
+            slowness, begun_s = SlownessWatch(monotonic_ns()), simulation.time_s
             least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs evenly timed steps
-            while not self._stop.wait(max(self._pacer.run_due(), least_s)):
-                with self._publishing:
-                    self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
-                    self._report_slowness()
-        except Exception as error:  # noqa: BLE001 reported to every driver, so that the thread does not end silently
-            for observer, _ in self._host.observers.values():
-                observer.failed(error)
+            try:
+                while not self._stop.wait(max(pacer.run_due(), least_s)):
+                    with self._publishing:
+                        self._publisher.publish(pacer.clock_ns(simulation.time_s - begun_s))
+                        if (share := slowness.update(pacer.lost_s, monotonic_ns())) is not None:
+                            self._report_slowness(share)
+            except Exception as error:  # noqa: BLE001 reported to every driver, as the thread must not end silently
+                for observer, _ in self._host.observers.values():
+                    observer.failed(error)
 
-    def _report_slowness(self) -> None:
-        share = self._slowness.update(self._pacer.lost_s, monotonic_ns())
-        if share is None:
-            return
+    def _report_slowness(self, share: float) -> None:
         speed = self._host.options.speed
         text = f"the computer is too slow for speed={speed:g}: the simulation runs at {share * speed:.2g}"
         for drone, (observer, _) in self._host.observers.items():

@@ -304,6 +304,7 @@ def _to_body(quaternion: tuple[float, float, float, float], vector: Vec3) -> Vec
 
 def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[float, ...]]:
     """Yield standard normal numbers indefinitely, ``count`` at a time."""
+    # Each drone has eight streams: numbers 0 to 5 for noise, and 7 for the biases.
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
     while True:
         yield from map(tuple, generator.standard_normal((_NOISE_BLOCK, count)).tolist())

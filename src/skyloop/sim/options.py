@@ -84,7 +84,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store ``step(n)``, which runs n steps, and ``speed``, the simulated seconds per second of clock time."""
+        """Start now. ``step(n)`` runs n steps; ``speed`` is in simulated seconds per second of clock time."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step

@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays for all drones. Forces are per mass, and torques per moment of inertia."""
+    """Constants of one drone, or arrays for all drones, in SI units."""
 
     thrust: N
     idle_speed: N

@@ -156,9 +156,9 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite if none.
+        """Return the distance [m] along a unit vector to the first solid, floor, or visible wall or ceiling at a time.
 
-        If the point is below the floor, the distance is 0.
+        It is infinite if there is none. A point below the floor counts as on the floor.
         """
         if self._movers:
             self.move(time_s)

@@ -215,7 +215,7 @@ class CirclePath:
 
 @dataclass(frozen=True, slots=True)
 class OvalPath:
-    """A level race track flown at a constant speed: two straights along x joined by half circles, counter-clockwise.
+    """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
     It starts ``start_m`` after the beginning of the southern straight, or of the northern one if clockwise.
     """

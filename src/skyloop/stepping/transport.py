@@ -89,7 +89,7 @@ class StepExecutor:
             except Empty:
                 return
             if job is None:
-                self._jobs.put(None)
+                self._jobs.put(None)  # which ends the thread later
                 return
             _run_logged(job)
 

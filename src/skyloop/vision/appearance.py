@@ -273,7 +273,6 @@ class TargetMemory:
     """
 
     def __init__(self, cv: Any, image: Image, box: Box) -> None:
-        """Remember the first appearance."""
         self._cv = cv
         self._appearances = [Appearance.of(cv, image, box)]
         self._look_alikes: list[Appearance] = []

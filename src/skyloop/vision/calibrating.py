@@ -115,7 +115,7 @@ class Board:
             dpi: Resolution, which is adjusted slightly so that a square has an integer number of pixels.
 
         Raises:
-            UsageError: The file name has a different ending, or a square would not have 20 to 2000 pixels.
+            UsageError: The file name has a different ending, or a square is smaller than 20 pixels or larger than 2000.
             MissingExtraError: Pillow or OpenCV is not installed.
         """
         file = Path(path)

@@ -56,7 +56,7 @@ def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
 def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    An OpenCV tracker takes one or two files and a name; if there is no name, ONNX Runtime loads the file.
+    ``tracker`` names the OpenCV tracker that loads the one or two files; without it, ONNX Runtime loads the file.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]

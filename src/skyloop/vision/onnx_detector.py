@@ -166,8 +166,8 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
 
 def _unknown(outputs: Outputs) -> FileFormatError:
     return FileFormatError(
-        f"its outputs ({describe(outputs)}) have no known layout: one output of YOLOv5 to v11, YOLOX or RT-DETR, "
-        "boxes and logits of a DETR, or boxes, scores and labels; for bare detection, one image at a time. "
+        f"its outputs ({describe(outputs)}) have no known layout: they must be one output of YOLOv5 to v11, YOLOX or "
+        "RT-DETR, boxes and logits of a DETR, or boxes, scores and labels, of one image, without masks or keypoints. "
         "If they are ambiguous, give layout=, one of " + ", ".join(each.value for each in Layout)
     )
 

@@ -49,6 +49,7 @@ class CompiledPainter(Painter):
         grid = raster.grid
         self._do = functions
         texels = atlas.image.view(np.int32)
+        # An overlapping view, in which each number is a texel and the next one.
         self._pairs = np.ndarray((texels.size - 1,), np.int64, texels.data, 0, (4,))
         self._grid = np.array([grid.width, grid.height, grid.fx, grid.fy, grid.cx, grid.cy], dtype=np.float64)
         self._fixed: tuple[NDArray[np.intp], Floats, Floats] | None = None

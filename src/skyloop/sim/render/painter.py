@@ -141,4 +141,4 @@ class PlainPainter(Painter):
         samples = np.empty((len(places), 4), np.uint8)
         self._shader.shade(table, seen[places], ray_x, ray_y, samples, np.empty(len(places), np.float32))
         total = samples.reshape(4, -1, 4).sum(axis=0, dtype=np.uint16)
-        colours[pixels] = total + 2 >> 2
+        colours[pixels] = total + 2 >> 2  # the rounded mean

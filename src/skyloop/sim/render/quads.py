@@ -273,8 +273,8 @@ class QuadBuilder:
     ) -> None:
         """Add an upright box that is visible from outside and extends from its lowest to its highest corner [m].
 
-        A pair of ``sides`` holds the textures of the faces normal to x and to y; ``ends`` is for top and bottom, by
-        default the texture along x.
+        A pair of ``sides`` holds the textures of the faces normal to x and to y; ``ends`` is for top and bottom, and by
+        default the texture of the faces normal to x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

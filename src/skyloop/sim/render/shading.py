@@ -65,7 +65,7 @@ def turned(vectors: Floats, rotation: Floats) -> Floats:
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return those ``shown`` quads, (n,), that would each be visible on its own from a pose through a grid.
+    """Return the ``shown`` quads, (n,), that would be visible from a pose through a grid if nothing occluded them.
 
     :class:`DepthBuffer` handles occlusion.
     """
@@ -279,7 +279,7 @@ class Shader:
         np.divide(1.0, w, out=inverse)
         # level = floor((floor(log2(footprint)) + 1) / 2), from the exponent bits, which also give scale = 2^-level
         np.take(table[9], seen, out=scale, mode="clip")
-        for _ in range(3):
+        for _ in range(3):  # the area that a pixel covers on a plane grows with the cube of its depth
             np.multiply(scale, inverse, out=scale)
         np.subtract(scale.view(np.int32), _ONE, out=levels)
         np.right_shift(levels, 24, out=levels)

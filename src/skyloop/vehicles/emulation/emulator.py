@@ -319,7 +319,7 @@ class RunningEmulator(ABC):
         """Handle a crash; by default its effect appears only in the drone's own data. Runs on the loop's thread."""
 
     def _handle_report(self) -> None:
-        self._posted = False
+        self._posted = False  # first, so that a report that arrives from now on is posted again
         if self._report is not None:
             self._tick(self._report)
 

@@ -64,7 +64,7 @@ class SimDriver(Driver):
     See ``docs/autopilots.md``.
 
     Args:
-        uri: The vehicle's address. If a host is given, it determines everything except the options for firmware.
+        uri: The vehicle's address. If ``host`` is given, only the address's options for firmware count.
         host: A shared world; None to let :meth:`open` create one.
         drone: Number of the drone on the host.
     """

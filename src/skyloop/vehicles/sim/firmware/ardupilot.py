@@ -240,7 +240,6 @@ class ArduCopter(CoupledFirmware):
         return commands
 
     def _read(self) -> Commands | None:
-        """Return the newest commands that have arrived."""
         commands: Commands | None = None
         for _ in range(_BURST if self._socket is not None else 0):
             assert self._socket is not None

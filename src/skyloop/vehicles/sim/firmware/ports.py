@@ -80,7 +80,7 @@ def reserve_instance(
             if all(is_free(kind, port) for kind, port in ports(instance)) and not runs(instance):
                 _reserved.add((firmware, instance))
                 return instance
-    raise UsageError(f"no ports are free for another {firmware}: {most} at most fly on one computer; end one of them")
+    raise UsageError(f"no ports are free for another {firmware}: {most} at most can fly on one computer")
 
 
 def release_instance(firmware: str, instance: int) -> None:
@@ -122,7 +122,7 @@ class SeparateNetwork:
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError without a new socket."""
+        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError if there is no new one."""
         newest = None
         with suppress(BlockingIOError):
             while descriptors := socket.recv_fds(self._ours, 1, 1)[1]:

@@ -200,13 +200,13 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
     if given:
         path = Path(given).expanduser()
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise UsageError(f"{variable} is {given!r}, which is not a program: it must be the path of {what}'s")
+            raise UsageError(f"{variable} is {given!r}, which is not a program: give the path of {what}'s program")
         return str(path.resolve())
     for name in names:
         found = shutil.which(name)
         if found is not None:
             return found
-    raise UsageError(f"{what}'s program is not here: set {variable} to its path. {where}")
+    raise UsageError(f"{what}'s program was not found: set {variable} to its path. {where}")
 
 
 def _ending(code: int | None) -> str:
