@@ -120,7 +120,7 @@ class Batteries:
 
 LOW_BATTERY = 0.03  # charge below which the vehicle lands, as a fraction from 0 to 1
 _HEIGHT_TOLERANCE_M = 0.08  # a take-off counts as finished at this distance below its target height
-_STANDING_S = 0.05  # a drone whose last ground contact is no longer ago than this counts as standing
+_STANDING_S = 0.05  # a drone counts as standing for this long after its last contact with the ground
 _KEPT_OCCURRENCES = 1000  # maximum number of occurrences kept until they are taken
 
 

@@ -34,7 +34,7 @@ class Contacts:
     """The contacts during one step."""
 
     standing: set[int] = field(default_factory=set)  #: drones standing on an object that is not a drone
-    #: pairs of drones of which one stands on the other, with the upper drone first
+    #: pairs of drones that stand on one another, the upper drone first
     upon: list[tuple[int, int]] = field(default_factory=list)
     #: drone, speed along the normal [m/s], and name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)

@@ -240,9 +240,10 @@ class Bodies(BodyTable):
         for drone, (_, constants) in self._each:
             self._move_one(drone, *constants)
 
-    def _turn_one(  # like _turn
+    def _turn_one(
         self, drone: int, damp: float, damp_yaw: float, most: float, most_yaw: float, airspeed_tilt: float
     ) -> None:
+        """Compute :meth:`_turn` for one drone."""
         roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read[drone]()
         stiff, stiff_pitch, stiff_yaw, roll_command, pitch_command, yaw_command = rest
         more_roll, more_pitch = self._tilt_one(drone, airspeed_tilt) if airspeed_tilt else (0.0, 0.0)
@@ -269,7 +270,7 @@ class Bodies(BodyTable):
         tilt = airspeed_tilt * (slowed * slowed / max(speed, 1e-9))
         return (cos_yaw * north - sin_yaw * east) * tilt, -(cos_yaw * east + sin_yaw * north) * tilt
 
-    def _move_one(  # like _move
+    def _move_one(
         self,
         drone: int,
         motor_share: float,
@@ -281,6 +282,7 @@ class Bodies(BodyTable):
         quadratic: float,
         quadratic_z: float,
     ) -> None:
+        """Compute :meth:`_move` for one drone."""
         thrust_command, sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw, *rest = self._moving.read[drone]()
         air_x, air_y, air_z, thrust, x, y, z, vx, vy, vz = rest
         thrust += (thrust_command - thrust) * motor_share

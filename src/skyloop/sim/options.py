@@ -130,7 +130,7 @@ class SlownessWatch:
         self._warned_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due, or None otherwise."""
+        """Return the achieved fraction of the simulation's speed if a warning is due, else None."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None

@@ -229,7 +229,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # The legs exert the supporting force at a lever arm no longer than the hull's radius.
+        # The legs exert the supporting force with a lever arm no longer than the hull's radius.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)

@@ -1,4 +1,4 @@
-"""The motion of targets. Each path is a sequence of points on a fixed time grid, which is computed as far as requested.
+"""The motion of targets. Each path is a sequence of points on a fixed time grid, computed as far ahead as requested.
 
 A target's position therefore depends only on the time and the seed.
 """

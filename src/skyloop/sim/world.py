@@ -186,7 +186,7 @@ class MarkerPattern:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker. ``pose`` is that of its centre; the top of the marker is the top of the picture."""
+    """A printed marker, with the pose of its centre. The top of the marker is the top of the picture."""
 
     name: str
     pose: FacePose

@@ -409,7 +409,7 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
         return FacePose(table.position, yaw, elevation, turn)
     for key in ("position", "yaw_deg", "elevation_deg"):
         if getattr(table, key) is not None:
-            raise place.error(key, "can't be combined with 'on', which places it flat on a face of the room")
+            raise place.error(key, "can't be combined with 'on', which fixes the object's pose")
     if table.at is None:
         raise place.error("at", "missing; it must be a list of 2 numbers")
     pose = _mounted(table.on, *table.at, turn, room)

@@ -124,7 +124,10 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect the only client, whose handler runs on the executor's thread. Raises LinkError if not possible."""
+        """Connect the only client; its handler runs on the executor's thread.
+
+        Raises LinkError if a client is connected already, or the server has been stopped.
+        """
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")

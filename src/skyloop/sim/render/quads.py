@@ -132,8 +132,8 @@ _CORNERS = 4  # number of corners, a quad's first vectors; the normal and the sl
 class Quads:
     """``n`` flat convex quadrilaterals. A triangle is stored with one corner repeated.
 
-    Texel u of a point X in the plane is ``u_slope · X + u_start``, and likewise for v. u points right and v points
-    down, both measured from the texture's top left corner.
+    The texel of a point X in the plane is u = ``u_slope · X + u_start`` to the right and v = ``v_slope · X + v_start``
+    down from the texture's top left corner.
     """
 
     vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)

@@ -22,7 +22,7 @@ _FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """All parts of a scene at a point in time. ``drone``: the drone to whose body a quad belongs, or -1, (n,)."""
+    """All parts of a scene at a point in time. ``drone``: the drone that each quad belongs to, or -1, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]

@@ -335,7 +335,7 @@ class Extremes:
 
     @staticmethod
     def along(values: NDArray[np.float32], axis: int) -> Extremes:
-        """Compute the extremes; axis 0 gives those of the columns."""
+        """Compute the extremes of the columns (axis 0) or of the rows (axis 1)."""
         least, most = values.min(axis=axis), values.max(axis=axis)
         return Extremes(least, most, float(least.min()), float(most.max()))
 

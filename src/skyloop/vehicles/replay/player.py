@@ -329,7 +329,7 @@ class ReplayPublisher:
 
 
 def described(applied: Applied) -> dict[str, Value]:
-    """Return a recorded command, both as requested and as applied, as native telemetry."""
+    """Return a recorded command as native telemetry, both as requested and as applied."""
     return {
         "replay.asked": applied.asked.name,
         "replay.asked.values": numbers(applied.asked),

@@ -164,7 +164,7 @@ class SimDriver(Driver):
         return "" if self._firmware is None else self._firmware.driver.left_to()
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action requested by the failsafe; for firmware, as its driver does."""
+        """Apply an action requested by the failsafe, through the firmware's driver if firmware flies the drone."""
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:

@@ -182,7 +182,7 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 def leave_network() -> None:
     """Move this process into a new network that has only a loopback interface.
 
-    This requires root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
+    Raises OSError, except for root or if the kernel allows unprivileged user namespaces.
     """
     if sys.platform != "linux":
         raise OSError("separate networks exist only on Linux")

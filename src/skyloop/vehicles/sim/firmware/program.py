@@ -210,7 +210,7 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
 
 
 def _ending(code: int | None) -> str:
-    with suppress(ValueError, TypeError):  # exit codes such as 255 stand for no signal
+    with suppress(ValueError, TypeError):  # an exit code such as 255 stands for no signal
         return f"was killed by {signal.Signals((code or 0) - 128).name}"
     return f"ended with exit code {code}"
 
