@@ -271,7 +271,7 @@ def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids)
         placed = _fill(world, parameters, solids, spawns, margin)
         if len(placed) == len(parameters):
             return placed
-    raise UsageError(f"world {world.name!r} has room for {len(placed)} drones only, not for {len(parameters)}")
+    raise UsageError(f"world {world.name!r} has room for only {len(placed)} drones, not for {len(parameters)}")
 
 
 def _fill(

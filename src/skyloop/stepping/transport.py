@@ -330,7 +330,7 @@ class StepScheduler(Scheduler):
         executor's thread, for example in an inline callback.
         """
         if self._executor.is_current:
-            raise UsageError("a callback in step with the recording can't wait for the next sample")
+            raise UsageError("a callback can't wait for the next sample: time does not advance until it returns")
         if not self._turn.acquire(blocking=False):
             return sleep()
         try:

@@ -81,7 +81,7 @@ def decode_servos(packet: bytes) -> ServoPacket:
             f"the magic number is {magic}, not {MAGIC_16} or {MAGIC_32}: not a packet of ArduPilot's outputs"
         )
     if len(packet) != _HEADER.size + outputs.size:
-        raise DecodeError(f"{len(packet)} bytes, where ArduPilot's outputs have {_HEADER.size + outputs.size}")
+        raise DecodeError(f"{len(packet)} bytes; ArduPilot's outputs have {_HEADER.size + outputs.size} bytes")
     return ServoPacket(rate, frame, outputs.unpack_from(packet, _HEADER.size))
 
 
