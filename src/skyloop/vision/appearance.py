@@ -102,7 +102,7 @@ class LongTermTracker(Tracker):
             self._tracker.shift(right, down)
 
     def similarity(self, image: Image, box: Sequence[float]) -> float:
-        """Return how similar a box's content is to the target, 0 to 1; 0 if a known look-alike fits better.
+        """Return how similar a box's content is to the target, 0 to 1; 0 if a known look-alike fits clearly better.
 
         Args:
             image: As in :meth:`update`.

@@ -70,8 +70,8 @@ class GroundTracker:
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too
-            few corners were found again, or if the attitude or height is unknown; tracking then restarts at the last
-            position.
+            few corners were found again, if the attitude or height is unknown, or below 0.15 m; tracking then restarts
+            at the last position.
 
         Raises:
             UsageError: The array has a wrong shape or type, or there are no intrinsics.
