@@ -471,7 +471,8 @@ class OnnxDetector:
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
             raise FileFormatError(
-                f"{self._path} has the input {shown}; it must be (1, 3, height, width), of type float, float16 or uint8"
+                f"{self._path} has the input {shown} and must have one of shape (1, 3, height, width) and type float, "
+                "float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
             raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for batches of 1")
