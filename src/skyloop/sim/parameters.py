@@ -144,7 +144,7 @@ class VehicleParameters:
     """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
-    mass_kg: float = 0.42  # includes the indoor hull [P]; for collisions and rotors; all other values are per mass
+    mass_kg: float = 0.42  # includes the indoor hull [P]; matters only in collisions and for rotors
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
     linear_drag_per_s: float = 0.45  # together with the next value, gives 0.57 1/s at 3 m/s; [E] identified c1 = 0.58

@@ -125,7 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all), if there is any."""
+        """Return a drone's deepest overlap with the room or the solids ``among`` (None: all); None if it has none."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None

@@ -14,7 +14,7 @@ from typing import Any, Final
 from skyloop.errors import FileFormatError, MissingExtraError
 
 CPU_S: Final = 20  #: limit of CPU time for loading a network and running it once
-MEMORY: Final = 4 << 30  #: limit of address space in bytes, in addition to four times the file's size
+MEMORY: Final = 4 << 30  #: limit of the address space [bytes], on top of four times the file's size
 _WAIT_S: Final = 300.0  # wall-clock limit, long enough for a busy computer
 _REFUSED: Final = 3  # exit code of a child that printed the reason
 _OWN: Final = Path(__file__).with_name("weights")
@@ -138,5 +138,5 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return an exception's text, shortened and on one line."""
-    # OpenCV's error.err is no alternative: it is on the class, and holds the last error raised anywhere.
+    # Not error.err, which OpenCV keeps on the class, so that it holds the last error raised anywhere.
     return " ".join(str(error).split())[:300]

@@ -77,7 +77,7 @@ def describe(outputs: Outputs) -> str:
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
+    """Recognise a network's layout from the size of its input and the named outputs of one run on any image.
 
     Raises FileFormatError if the outputs fit no family or several. ``classes`` is the number of class names.
     """
@@ -234,7 +234,7 @@ def _shares(boxes: Floats) -> bool:
 
 
 def _as_scores(values: Floats) -> Floats:
-    """Return scores unchanged and logits through a sigmoid; values outside 0 to 1 mean logits."""
+    """Return scores unchanged, but logits after a sigmoid; values outside 0 to 1 mean logits."""
     finite = values[np.isfinite(values)]
     if len(finite) and (finite.min() < 0.0 or finite.max() > 1.0):
         return np.asarray(1.0 / (1.0 + np.exp(-values)), np.float64)

@@ -180,7 +180,7 @@ def _car(atlas: AtlasBuilder, target: FigureTarget) -> Figure:
 def _cabin(
     shapes: QuadBuilder, low: Vec3, roof: Vec3, bottom: float, top: float, textures: tuple[Texture, Texture, Texture]
 ) -> None:
-    """Add a cabin with slanted sides. ``low``, ``roof``: x from, x to, ±y. Textures: of ends, of sides, of the roof."""
+    """Add a cabin with slanted sides. ``low`` and ``roof`` are x from, x to, ±y; textures: of ends, sides and roof."""
     (a0, a1, b), (c0, c1, d) = low, roof
     under = [np.array(p) for p in ((a0, -b, bottom), (a1, -b, bottom), (a1, b, bottom), (a0, b, bottom))]
     over = [np.array(p) for p in ((c0, -d, top), (c1, -d, top), (c1, d, top), (c0, d, top))]

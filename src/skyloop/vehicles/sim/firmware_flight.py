@@ -204,7 +204,7 @@ class FirmwareFlight:
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback, with the true state at the same time if that is known already."""
+        """Return the firmware's feedback with the true state at its time, or unchanged if no report has arrived."""
         reports = tuple(self._reports)
         if not reports:
             return feedback

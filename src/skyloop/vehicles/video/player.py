@@ -211,7 +211,7 @@ class FilePacer:
         self._due_ns = 0
 
     def due_ns(self, stamp_s: float, now_ns: int) -> int:
-        """Return the time to show the image with this stamp, given that it was ready at ``now_ns``."""
+        """Return the time at which to show the image with this stamp, given that it was ready at ``now_ns``."""
         if self._stamp_s is None:
             self._due_ns = now_ns
         else:

