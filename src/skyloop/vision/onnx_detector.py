@@ -140,15 +140,14 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
     with np.errstate(over="ignore", invalid="ignore"):  # hostile numbers become infinite and are dropped later
         if layout is Layout.LISTS:
             boxes, scores, labels = _lists(outputs)
-            finite = np.where(np.isfinite(labels), labels, -1.0)
-            return Found(boxes, scores, _whole(finite))
+            return Found(boxes, scores, _whole(labels))
         if layout in (Layout.DETR, Layout.RF_DETR):
             shares, certainties = _pair(outputs)
             return _shared(_numbers(shares)[0], _as_scores(_numbers(certainties)[0]), width, height)
         rows = _numbers(_single(outputs, layout))[0]
         if layout is Layout.END_TO_END:
             _columns(rows, 6, layout, outputs, exactly=True)
-            return Found(rows[:, :4], rows[:, 4], _whole(np.where(np.isfinite(rows[:, 5]), rows[:, 5], -1.0)))
+            return Found(rows[:, :4], rows[:, 4], _whole(rows[:, 5]))
         if layout is Layout.YOLO8 and rows.shape[0] < rows.shape[1]:
             rows = rows.T
         if layout in (Layout.RT_DETR, Layout.YOLO8):
@@ -259,7 +258,9 @@ def _surest(corners: Floats, scores: Floats) -> Found:
 
 
 def _whole(labels: Floats) -> NDArray[np.int64]:
-    return np.clip(np.round(labels), -1, 1e6).astype(np.int64)
+    """Return class numbers; -1 for labels that are not finite, whose rows are dropped later."""
+    finite = np.where(np.isfinite(labels), labels, -1.0)
+    return np.clip(np.round(finite), -1, 1e6).astype(np.int64)
 
 
 def _grid(rows: int, width: int, height: int, outputs: Outputs) -> tuple[Floats, Floats]:
