@@ -302,7 +302,7 @@ def test_wrong_arguments_are_refused() -> None:
         Simulation(HALL).feedback(1)
     with pytest.raises(UsageError, match=r"skyloop\.messages"):
         Simulation(HALL).command(0, "takeoff")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=r"room for \d+ drones only"):
+    with pytest.raises(UsageError, match=r"room for only \d+ drones"):
         Simulation(load_world("room"), 200)
     with pytest.raises(UsageError, match="tilt_rad must be a number from"):
         Limits(tilt_rad=math.nan)

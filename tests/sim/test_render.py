@@ -213,13 +213,13 @@ def test_mismatched_arguments_are_refused(scene: Scene) -> None:
     state = state_at([(0.0, 0.0, 1.0)] * 2)
     pose = PLAIN.pose(np.zeros(3), np.eye(3))
     renderer = PlanarRenderer(scene)
-    with pytest.raises(UsageError, match="out is"):
+    with pytest.raises(UsageError, match="out has"):
         renderer.render(state, pose, PLAIN, np.empty((10, 10, 3), np.uint8))
     with pytest.raises(UsageError, match="2 drones"):
         renderer.render(state_at([(0.0, 0.0, 1.0)]), pose, PLAIN)
     with pytest.raises(UsageError, match="moving targets"):
         renderer.render(replace(state, targets=()), pose, PLAIN)
-    with pytest.raises(UsageError, match="folds"):
+    with pytest.raises(UsageError, match="no inverse"):
         renderer.render(state, pose, replace(PLAIN, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0)))
 
 

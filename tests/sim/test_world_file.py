@@ -132,8 +132,8 @@ BAD = [
     (ROOM + BOX + "position = [1, 1, 1]\n", "'position': give either this or 'stands_at', not both"),
     (ROOM + "[[box]]\nstands_at = [1, {}]\nsize = [1, 1, 1]\n", r"\[box #1\], key 'stands_at': {} .a table. given"),
     (ROOM + FACE + "on = 'north'\n", "'at': missing; it must be a list of 2 numbers"),
-    (ROOM + FACE + "on = 'north'\nat = [0, 1]\nyaw_deg = 3\n", "'yaw_deg': unknown together with 'on'"),
-    (ROOM + FACE + "at = [0, 1]\n", "'at': unknown without 'on'"),
+    (ROOM + FACE + "on = 'north'\nat = [0, 1]\nyaw_deg = 3\n", "'yaw_deg': can't be combined with 'on'"),
+    (ROOM + FACE + "at = [0, 1]\n", "'at': needs 'on'"),
     (ROOM + FACE, "'position': missing; .* or 'on' and 'at'"),
     (ROOM + "[[spawn]]\nposition = [0, 0, 0]\nyaw_deg = 400\n", "'yaw_deg': 400 .* a number from -360 to 360"),
     (ROOM + BOARD + "path = { speed = 1, radius = 1 }\n", "'kind': missing; it must be one of waypoints, circle"),
@@ -268,7 +268,7 @@ def test_the_seed_places_varied_objects_within_their_ranges_and_apart(tmp_path: 
 
 
 def test_objects_without_room_are_reported() -> None:
-    with pytest.raises(FileFormatError, match=r"\[vary\], key 'apart': no room was found for 3 things at 15 m"):
+    with pytest.raises(FileFormatError, match=r"\[vary\], key 'apart': no room for 3 objects at least 15 m apart"):
         parse_world(VARIED.replace("apart = 2.0", "apart = 15.0"))
     with pytest.raises(FileFormatError, match=r"position.*missing"):
         parse_world(VARIED.replace("stands_at = [0, 0]\n", ""))

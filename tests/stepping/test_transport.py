@@ -183,4 +183,4 @@ def test_a_handler_that_raises_does_not_end_the_world(
         executor.call(wrong, lambda: None)
     settle(executor)
     assert application.heard == [b"re go on"]
-    assert "a step of a replay failed" in caplog.text
+    assert "a step in simulated time failed" in caplog.text

@@ -38,7 +38,7 @@ Observe = Literal["state", "pixels", "both"]
 Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
 
 SIZES_PX: Final = (16, 512)  #: smallest and largest edge length of an observed image
-SIZE: Final = (320, 240)
+SIZE: Final = (320, 240)  #: width and height of a rendered image [px]
 ONBOARD_PX: Final = 64  #: default edge length of the onboard camera's images
 _FOCAL_PX: Final = 260.0  #: focal length of the rendering camera
 _ONBOARD_FOCAL: Final = 40.0 / 64.0  # focal length divided by the edge length: 77° field of view

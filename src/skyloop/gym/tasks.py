@@ -16,8 +16,7 @@ from skyloop.sim.vehicles import VEHICLES
 
 CELL_M: Final = 8.0  #: side length of the square reserved for each drone
 REACH_M: Final = 3.5  #: a drone further than this from its cell's centre has left it
-LOWEST_M: Final = 0.3
-HIGHEST_M: Final = 4.5
+LOWEST_M, HIGHEST_M = 0.3, 4.5  #: minimum and maximum height within the cell
 _UP_S: Final = 15.0  #: time allowed for all drones to take off
 
 
@@ -112,8 +111,8 @@ SPEED_M_S: Final = 1.0  #: velocity commanded by an action of 1
 TURN_RAD_S: Final = 1.5  #: turn rate commanded by an action of 1
 NEAR_M: Final = 0.2  #: a goal closer than this counts as reached
 FOLLOWED_M: Final = 1.5  #: desired distance from a followed target
-GATES: Final = 4
-GATE_RADIUS_M: Final = 0.5
+GATES: Final = 4  #: number of gates of a course
+GATE_RADIUS_M: Final = 0.5  #: maximum distance from a gate's centre at which the gate counts as passed
 _GATE_RING_M: Final = 1.8  #: radius of the circle on which the gates are placed
 _FOLLOWING_M: Final = 0.3  #: maximum distance error at which a target counts as followed
 _FOLLOWING_RAD: Final = 0.35  #: maximum bearing at which the target counts as followed
@@ -122,7 +121,7 @@ _HEIGHT: Final = 2.0  #: height of the middle of a cell [m]
 _WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from the middle of its cell, per axis [m]
 _WALK_RAD_S: Final = 0.18  #: angular rate of the walk, which limits its speed to 0.3 m/s
 _FAILURE: Final = -5.0  #: reward for leaving the cell or crashing
-_FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
+_FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])  #: commands for actions of 1
 #: Bounds for the goal forward, left, up [m]; velocity forward, left, up [m/s]; roll, pitch [rad]; turn's sine, cosine
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
 MOTION: Final = slice(3, 8)  #: the part of an observation that holds the drone's own motion: velocity, roll, pitch
@@ -179,7 +178,7 @@ class Reaching:
         self._before[which] = 0.0
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
-        """Return each drone's reward, whether its episode terminated or was truncated, and further values."""
+        """Apply actions for one period; return the rewards, the flags terminated and truncated, and further values."""
         bounded = np.minimum(np.maximum(np.where(np.isnan(actions), 0.0, actions), -1.0), 1.0)
         self.arena.step(bounded * _FULL)
         self.age += 1
@@ -227,7 +226,7 @@ class Reaching:
         return start, heading
 
     def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others use it
-        """Return the rewards, flags for completed tasks, and further values."""
+        """Return the rewards, which tasks are completed, and further values."""
         distances = np.linalg.norm(self.goals - places, axis=1)
         rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
         infos: Infos = {"distance_m": distances, "is_success": distances < NEAR_M}

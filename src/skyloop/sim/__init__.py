@@ -1,6 +1,6 @@
-"""The simulator: worlds loaded from text files, and quadrotors with the logic of real firmware; its owner steps it.
+"""The simulator: worlds loaded from text files, and quadrotors with the logic of real firmware.
 
-It is independent of proxies and networks. Only :class:`Pacer` reads a wall clock.
+Its owner advances it step by step. It imports neither proxies nor networks, and only :class:`Pacer` reads a clock.
 """
 
 from skyloop.sim.dynamics import STEP_S

@@ -120,8 +120,8 @@ class Batteries:
 
 LOW_BATTERY = 0.03  # charge below which the vehicle lands, as a fraction from 0 to 1
 _HEIGHT_TOLERANCE_M = 0.08  # a take-off counts as finished at this distance below its target height
-_STANDING_S = 0.05  # a drone whose last ground contact is no longer ago than this counts as standing
-_KEPT_OCCURRENCES = 1000
+_STANDING_S = 0.05  # a drone counts as standing for this long after its last contact with the ground
+_KEPT_OCCURRENCES = 1000  # maximum number of occurrences kept until they are taken
 
 
 class Autopilot:
@@ -151,8 +151,8 @@ class Autopilot:
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point already in force is not clamped until it is sent again. Changes to the limits on tilt, climb and
-        altitude, which the control loops enforce, take effect immediately.
+        A set-point in force is not clamped until it is sent again. The limits on climb, on altitude and on the tilt for
+        a velocity take effect immediately, because the control loops enforce them.
         """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
@@ -289,6 +289,7 @@ class Autopilot:
 
     def _start(self, drone: int, before: FlightState) -> None:
         limits, altitude = self.limits[drone], float(self._sensors.altitude[drone])
+        # A drone may start from a platform. In the air, what is below it is unknown, so take the floor.
         ground = altitude if before is FlightState.LANDED else 0.0
         height = min(ground + limits.takeoff_altitude_m, max(limits.altitude_m, altitude))
         self._rising[drone] = height

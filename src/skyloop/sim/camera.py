@@ -138,7 +138,8 @@ class CameraModel:
             height=round(self.height * factor),
             fx=self.fx * factor,
             fy=self.fy * factor,
-            cx=(self.cx + 0.5) * factor - 0.5,
+            cx=(self.cx + 0.5) * factor
+            - 0.5,  # the image's edge, half a pixel from the first centre, stays at the edge
             cy=(self.cy + 0.5) * factor - 0.5,
         )
 
@@ -152,12 +153,12 @@ class CameraModel:
         """Return x/z and y/z in optical axes for the given pixels; both arrays have shape (n, 2).
 
         Raises:
-            UsageError: The distortion folds the image over itself.
+            UsageError: The distortion can't be inverted for one of the pixels.
         """
         bent = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         straight = undistort(bent, self.distortion) if self.distorted else bent
         if straight is None:
-            raise UsageError(f"camera {self.name!r}: distortion {self.distortion} folds the image before its edge")
+            raise UsageError(f"camera {self.name!r}: distortion {self.distortion} has no inverse at some pixels")
         return straight
 
 

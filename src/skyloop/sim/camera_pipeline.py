@@ -19,7 +19,7 @@ from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, SensorEffects
 from skyloop.sim.world import World
 
-_LONGEST_WAIT_S: Final = 0.5
+_LONGEST_WAIT_S: Final = 0.5  # a notification or a due frame normally ends the rendering thread's wait sooner
 #: Ratio of rendered to used frames if fewer frames are used than the camera takes. A consumer that selects frames by
 #: its own count then always finds one in time.
 RATE_MARGIN: Final = 1.25
@@ -37,9 +37,8 @@ class Shutter:
     """Decides when a camera exposes, using absolute simulation times. Pure."""
 
     def __init__(self, offset_s: float = 0.0) -> None:
-        """Set the time of the first exposure [s]."""
-        self._next_s = offset_s
-        self.count = 0  #: number of exposures so far, including those without an observer
+        self._next_s = offset_s  # time of the first exposure
+        self.count = 0  #: number of exposures so far, including those that were not rendered
 
     def due(self, now_s: float, fps: float) -> bool:
         """Return whether an exposure is due. Exposures that were missed during a pause are not made up for."""
@@ -65,7 +64,7 @@ class Camera:
     _limiter: RateLimiter = field(default_factory=lambda: RateLimiter(None), init=False)
 
     def wanted(self, captured_ns: int, fps: float) -> bool:
-        """Return whether to render the exposure that is due, given the frames per second that are wanted (0 to inf)."""
+        """Return whether to render the exposure that is due, given the frames per second in use (0 to inf)."""
         if not fps:
             return False
         enough = fps * RATE_MARGIN
@@ -99,7 +98,7 @@ class Pipeline(ABC):
     def __init__(self) -> None:
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap ordered by due time
         self._order = itertools.count()
-        self._handing = threading.RLock()
+        self._delivering = threading.RLock()  # reentrant, because a screen may detach its cameras during a delivery
 
     @abstractmethod
     def expose(self, exposures: list[Exposure]) -> None:
@@ -113,13 +112,13 @@ class Pipeline(ABC):
         """Deliver the frames that are due now."""
         while self._finished and self._finished[0][0] <= now_ns:
             _, _, exposure, picture = heapq.heappop(self._finished)
-            with self._handing:
+            with self._delivering:
                 if not exposure.camera.gone:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Stop delivering frames from these cameras. Once this has returned, no other thread delivers frames."""
-        with self._handing:
+        """Stop delivering frames from these cameras. After this returns, no other thread delivers any of them."""
+        with self._delivering:
             for camera in cameras:
                 camera.gone = True
 
@@ -199,18 +198,13 @@ class CameraPipeline(Pipeline):
 
 
 class SteppedCameraPipeline(Pipeline):
-    """Renders each exposure immediately and delivers due frames on request, all on one thread.
-
-    Intended for a world whose time advances in explicit steps only.
-    """
+    """Renders exposures immediately and delivers due frames on request, for a world that is stepped on one thread."""
 
     def __init__(self, world: World, drones: int, quality: str) -> None:
-        """Create the renderer."""
         super().__init__()
         self._renderer = make_renderer(world, drones, quality)
 
     def expose(self, exposures: list[Exposure]) -> None:
-        """Render exposures."""
         for exposure in exposures:
             self._develop(self._renderer, exposure)
 

@@ -34,7 +34,7 @@ class Contacts:
     """The contacts during one step."""
 
     standing: set[int] = field(default_factory=set)  #: drones standing on an object that is not a drone
-    #: pairs of drones of which one stands on the other, with the upper drone first
+    #: pairs of drones that stand on one another, the upper drone first
     upon: list[tuple[int, int]] = field(default_factory=list)
     #: drone, speed along the normal [m/s], and name of the other object
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
@@ -95,15 +95,15 @@ class Collisions:
         if np.count_nonzero(self._on_floor):
             contacts = Contacts()
             self._meet_floor(self._on_floor.nonzero()[0], contacts)
-        looked = step >= self._next
-        if looked:
+        refreshed = step >= self._next
+        if refreshed:
             self._run_broad_phase(step)
         elif self._near.moving:
             self._solids.move((step + 1) * STEP_S)
         if len(self._near.one) or self._near.solids:
             contacts = contacts or Contacts()
             self._narrow(step, contacts)
-        if looked or self._near.solids:
+        if refreshed or self._near.solids:
             np.copyto(self._free, self._bodies.position)
         return contacts
 
@@ -305,7 +305,6 @@ class Collisions:
         return strayed
 
     def _close_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs of overlapping drones."""
         near, position = self._near, self._bodies.position
         apart = position.take(near.one, axis=1) - position.take(near.other, axis=1)
         np.multiply(apart, apart, out=apart)
@@ -318,7 +317,6 @@ class Collisions:
         return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
     def _separate(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
-        """Separate two drones; return whether one might leave the broad phase's reach in the time left."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -368,5 +366,5 @@ def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, 
 
 
 def _span(acceleration_m_s2: float, steps: int) -> float:
-    """Return the maximum distance that a drone covers from rest in a number of steps [m]."""
+    """Return the maximum distance [m] that a drone can cover from rest in this many steps."""
     return acceleration_m_s2 * STEP_S * STEP_S * steps * (steps + 1) / 2

@@ -122,7 +122,7 @@ _REFERENCE_LEAD_M = 0.5  # maximum lead of the altitude reference over the vehic
 _HELD_M = 0.25  # minimum distance above its expected descent at which a landing drone is considered held up
 _HELD_CLIMB_M_S = 0.15  # maximum climb rate at which a drone counts as held up; a faster drone is simply still rising
 _HELD_EASE_PER_S2 = 8.0  # reduction of thrust per metre that the drone is further behind
-_HELD_REGAIN = 4.0  # factor by which the lag shrinks faster; otherwise the drone would drop when it is released
+_HELD_REGAIN = 4.0  # the lag shrinks this many times as fast, so that the drone doesn't drop when it is released
 _INTEGRATED_ERROR_M_S = 0.25  # limit for the integrated error, so that braking does not wind up the integral
 _MOST_INTEGRAL_M_S2 = 3.0  # limit of the integral, which applies when a wall holds the drone back
 

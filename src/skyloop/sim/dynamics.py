@@ -36,7 +36,7 @@ def columns(rows: int, drones: int) -> Floats:
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns`; for a few drones, as plain floats."""
+    """Plain floats in consecutive rows of an array made by :func:`columns` for a few drones."""
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
         rows, drones = table.shape
@@ -212,17 +212,14 @@ class Bodies(BodyTable):
         return [(tuple(one), tuple(other)) for one, other in zip(*rows, strict=True)]
 
     def cut(self, drone: int) -> None:
-        """Stop the motors, so that nothing holds the attitude."""
         self._stiff[:, drone] = 0.0
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Hold the attitude again, with the motors running or the legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Change a body's turn rate about the vertical."""
         self.rates[2, drone] += change_rad_s
         self.angles[2, drone] += change_rad_s * STEP_S
 
@@ -232,15 +229,10 @@ class Bodies(BodyTable):
         return power
 
     def step(self) -> None:
-        """Advance by :data:`STEP_S`, without collisions."""
-        if self._few:
-            self._step_each()
-        else:
+        if not self._few:
             self._turn()
             self._move()
-
-    def _step_each(self) -> None:
-        """Do the work of :meth:`_turn` and :meth:`_move` for one drone at a time."""
+            return
         for drone, (constants, _) in self._each:
             self._turn_one(drone, *constants)
         np.sin(self.angles, out=self.sin)
@@ -251,6 +243,7 @@ class Bodies(BodyTable):
     def _turn_one(
         self, drone: int, damp: float, damp_yaw: float, most: float, most_yaw: float, airspeed_tilt: float
     ) -> None:
+        """Compute :meth:`_turn` for one drone."""
         roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read[drone]()
         stiff, stiff_pitch, stiff_yaw, roll_command, pitch_command, yaw_command = rest
         more_roll, more_pitch = self._tilt_one(drone, airspeed_tilt) if airspeed_tilt else (0.0, 0.0)
@@ -269,7 +262,7 @@ class Bodies(BodyTable):
         self._turned.write[drone](roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
 
     def _tilt_one(self, drone: int, airspeed_tilt: float) -> tuple[float, float]:
-        """Do the work of :meth:`_tilt_by_airspeed` for one drone."""
+        """Compute :meth:`_tilt_by_airspeed` for one drone."""
         *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read[drone]()
         east, north = vx - air_x, vy - air_y
         speed = math.sqrt(east * east + north * north)
@@ -289,6 +282,7 @@ class Bodies(BodyTable):
         quadratic: float,
         quadratic_z: float,
     ) -> None:
+        """Compute :meth:`_move` for one drone."""
         thrust_command, sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw, *rest = self._moving.read[drone]()
         air_x, air_y, air_z, thrust, x, y, z, vx, vy, vz = rest
         thrust += (thrust_command - thrust) * motor_share

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
     from skyloop.sim.camera_pipeline import Camera, Pipeline, Screen
 
-TICK_S: Final = 0.008  #: simulated time per batch of steps
+TICK_S: Final = 0.008  #: time between batches of steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class SimHost:
             charge=self.options.battery,
             wind=self.wind,
         )
-        self.stepping = threading.Lock()  #: held while stepping, as a thread that is ending may still be in a step
+        self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; always replaced as a whole, never modified.
         self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
@@ -82,8 +82,8 @@ class SimHost:
     def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
-        Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread. A
-        drone has one observer: for a second one this raises UsageError.
+        Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread.
+        Raises UsageError if there is no such drone, or it already has an observer.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
@@ -97,9 +97,9 @@ class SimHost:
             return cameras
 
     def detach(self, drone: int, observer: Observer) -> None:
-        """Stop reporting to an observer; do nothing if a different observer is attached. The last one stops the world.
+        """Stop reporting to an observer, or do nothing if a different one is attached. No report is running afterwards.
 
-        No report is running when this returns.
+        The world stops when its last observer is detached.
         """
         with self._lock:
             entry = self.observers.get(drone)
@@ -138,7 +138,7 @@ class Stepper(Protocol):
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """Wait for the current round of reports. After this call, no frames from these cameras are delivered."""
+        """Stop delivering frames from these cameras, after the current round of reports has ended."""
 
 
 class ReportPublisher:
@@ -210,34 +210,28 @@ class _RealTimeStepper:
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
         if self._thread is not threading.current_thread():
-            with self._publishing:
+            with self._publishing:  # waits for the current round of reports
                 pass
         if self._publisher.pipeline is not None:
             self._publisher.pipeline.forget(cameras)
 
     def _run(self) -> None:
+        options, simulation = self._host.options, self._simulation
         with self._host.stepping:
-            self._step_on()
-
-    def _step_on(self) -> None:
-        options = self._host.options
-        self._pacer = Pacer(self._simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
-        self._slowness = SlownessWatch(monotonic_ns())
-        self._begun_s = self._simulation.time_s
-        try:
+            pacer = Pacer(simulation.step, speed=options.speed, most_lag_s=options.most_lag_s)
+            slowness, begun_s = SlownessWatch(monotonic_ns()), simulation.time_s
             least_s = STEP_S if options.autopilot is not None else TICK_S  # firmware needs evenly timed steps
-            while not self._stop.wait(max(self._pacer.run_due(), least_s)):
-                with self._publishing:
-                    self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
-                    self._report_slowness()
-        except Exception as error:  # noqa: BLE001 reported to every driver, so that the thread does not end silently
-            for observer, _ in self._host.observers.values():
-                observer.failed(error)
+            try:
+                while not self._stop.wait(max(pacer.run_due(), least_s)):
+                    with self._publishing:
+                        self._publisher.publish(pacer.clock_ns(simulation.time_s - begun_s))
+                        if (share := slowness.update(pacer.lost_s, monotonic_ns())) is not None:
+                            self._report_slowness(share)
+            except Exception as error:  # noqa: BLE001 reported to every driver, as the thread must not end silently
+                for observer, _ in self._host.observers.values():
+                    observer.failed(error)
 
-    def _report_slowness(self) -> None:
-        share = self._slowness.update(self._pacer.lost_s, monotonic_ns())
-        if share is None:
-            return
+    def _report_slowness(self, share: float) -> None:
         speed = self._host.options.speed
         text = f"the computer is too slow for speed={speed:g}: the simulation runs at {share * speed:.2g}"
         for drone, (observer, _) in self._host.observers.items():

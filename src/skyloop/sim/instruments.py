@@ -1,6 +1,6 @@
 """The instruments of a rotor-level drone as its firmware reads them, with noise, bias, rate and delay.
 
-All worlds have their origin at the same place on Earth: in Zürich, where PX4's simulations start by default.
+All worlds have their origin at the same place on Earth, in Zürich, where PX4's simulations start by default.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Firmware(Protocol):
 
 
 LATITUDE_DEG: Final = 47.397742  #: latitude of the worlds' origin, WGS 84
-LONGITUDE_DEG: Final = 8.545594
+LONGITUDE_DEG: Final = 8.545594  #: longitude of that origin
 ALTITUDE_M: Final = 488.0  #: height of the worlds' floor above mean sea level
 
 #: The Earth's magnetic field at the worlds' origin: east, north, up, from the World Magnetic Model 2025 for early 2026.
@@ -145,7 +145,7 @@ _NOISE_BLOCK = 256  # number of samples whose noise is drawn in one call
 _WANDER_STEPS = 100  # number of steps between changes of the biases (10 Hz)
 _LEAST_FLOW_M = 0.08  # minimum height; below it, the image is out of focus
 _GPS_VERTICAL = 1.7  # ratio of the vertical error to the horizontal error
-_SATELLITES = 14
+_SATELLITES = 14  # number reported with every fix
 
 
 class Instruments:
@@ -304,6 +304,7 @@ def _to_body(quaternion: tuple[float, float, float, float], vector: Vec3) -> Vec
 
 def _rows(seed: int, drone: int, instrument: int, count: int) -> Iterator[tuple[float, ...]]:
     """Yield standard normal numbers indefinitely, ``count`` at a time."""
+    # Each drone has eight streams: numbers 0 to 5 for noise, and 7 for the biases.
     generator = stream(seed, Purpose.INSTRUMENTS, drone * 8 + instrument)
     while True:
         yield from map(tuple, generator.standard_normal((_NOISE_BLOCK, count)).tolist())

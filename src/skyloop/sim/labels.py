@@ -50,6 +50,7 @@ class Labeller:
         world = scene.world
         self._things: list[tuple[str, str, NDArray[np.bool_]]] = []
         for number, target in enumerate(world.targets):
+            # BoardTarget is a board, and PlatformTarget a platform.
             kind = target.shape if isinstance(target, FigureTarget) else type(target).__name__[:-6].lower()
             self._things.append((target.name, kind, scene.target_of == number))
         for number, box in enumerate(world.boxes):
@@ -57,7 +58,7 @@ class Labeller:
                 self._things.append((box.name, "box", scene.box_of == number))
 
     def boxes(self, state: SceneState, pose: CameraPose, model: CameraModel) -> tuple[TargetBox, ...]:
-        """Return the box of every target and crate with a pixel in the image, even a hidden one; targets come first."""
+        """Return the box of every target and crate with a pixel in the image, even if hidden; targets come first."""
         raster = Raster.of(model, 1)
         posed = self._scene.posed(state)
         shown = np.ones(len(posed.quads), np.bool_) if pose.drone is None else posed.drone != pose.drone

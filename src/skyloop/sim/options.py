@@ -70,7 +70,7 @@ class Pacer:
     """Runs the steps that are due, using absolute deadlines: step k is due at start + k · STEP_S / speed.
 
     The pacer catches up on small delays. If the lag exceeds ``most_lag_s``, the excess is skipped and counted in
-    ``lost_s``, and the deadlines are postponed. Not thread-safe: a pacer must be used by one thread only::
+    ``lost_s``, and the deadlines are postponed. Use a pacer from one thread only::
 
         while not stop.wait(pacer.run_due()):
             publish()
@@ -84,7 +84,7 @@ class Pacer:
         most_lag_s: float = MOST_LAG_S,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """Store ``step(n)``, which runs n steps, and ``speed``, the simulated seconds per second of clock time."""
+        """Start now. ``step(n)`` runs n steps; ``speed`` is in simulated seconds per second of clock time."""
         if not (math.isfinite(speed) and 0 < speed <= 1000):
             raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
         self._step = step
@@ -127,16 +127,16 @@ class SlownessWatch:
     def __init__(self, now_ns: int) -> None:
         self._since_ns = now_ns
         self._lost_s = 0.0
-        self._said_ns: int | None = None
+        self._warned_ns: int | None = None
 
     def update(self, lost_s: float, now_ns: int) -> float | None:
-        """Return the achieved fraction of the simulation's speed if a warning is due, or None otherwise."""
+        """Return the achieved fraction of the simulation's speed if a warning is due, else None."""
         passed_ns = now_ns - self._since_ns
         if passed_ns < SLOW_NS:
             return None
         share = 1.0 - (lost_s - self._lost_s) * NS_PER_S / passed_ns
         self._since_ns, self._lost_s = now_ns, lost_s
-        if share >= SLOW_SHARE or (self._said_ns is not None and now_ns - self._said_ns < SLOW_AGAIN_NS):
+        if share >= SLOW_SHARE or (self._warned_ns is not None and now_ns - self._warned_ns < SLOW_AGAIN_NS):
             return None
-        self._said_ns = now_ns
+        self._warned_ns = now_ns
         return share

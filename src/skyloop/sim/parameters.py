@@ -31,8 +31,8 @@ Places = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tu
 class InstrumentParameters:
     """Errors, rates and delays of a vehicle's instruments.
 
-    ``noise`` is the standard deviation of a sample, and ``bias`` that of the initial error of a flight, which then
-    wanders with the time constant; the gyro has its own. See ``docs/rotors.md`` for the sources of the defaults.
+    ``noise`` is the standard deviation of a sample, and ``bias`` that of the error at the start, which then wanders
+    with a time constant (the gyro has its own). See ``docs/rotors.md`` for the sources of the defaults.
     """
 
     gyro_noise_rad_s: float = 0.002
@@ -87,7 +87,7 @@ class RotorParameters:
     rotor_drag_kg: float
     rotor_inflow_kg: float  #: the same force along the rotors' axes, where air from above reduces the thrust
     body_drag_kg_m: Vec3  #: force per airspeed squared, along the body's axes
-    efficiency: float  #: fraction of the battery's power that is transferred to the air as shaft torque times speed
+    efficiency: float  #: power of the rotors' shafts (torque times speed) as a fraction of the battery's power
     #: inertia of a rotor about its axis; when a rotor accelerates, the body turns the other way
     rotor_inertia_kg_m2: float = 0.0
     instruments: InstrumentParameters = field(default_factory=InstrumentParameters)
@@ -136,7 +136,7 @@ def _check(
             raise UsageError(f"{one.name} must be {least}, not {value!r}")
 
 
-GRAVITY_M_S2 = 9.80665
+GRAVITY_M_S2 = 9.80665  # standard gravity
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +144,7 @@ class VehicleParameters:
     """A vehicle's body, motors, loops, battery and sensors."""
 
     # Body
-    mass_kg: float = 0.42  # includes the indoor hull [P]; used only in drone collisions; everything else is per mass
+    mass_kg: float = 0.42  # includes the indoor hull [P]; matters only in collisions and for rotors
     radius_m: float = 0.26  # radius of the hull, which is 517 mm across [P]
     half_height_m: float = 0.06  # half height of the hull; estimate
     linear_drag_per_s: float = 0.45  # together with the next value, gives 0.57 1/s at 3 m/s; [E] identified c1 = 0.58

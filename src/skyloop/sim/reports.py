@@ -59,7 +59,7 @@ class OccurrenceKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Occurrence:
-    """Something that happened to a drone. ``speed_m_s`` is the speed along the normal of a collision; otherwise 0."""
+    """Something that happened to a drone. ``speed_m_s`` is the speed along the normal for collisions, else 0."""
 
     kind: OccurrenceKind
     drone: int

@@ -1,4 +1,4 @@
-"""Formulas of the rotor-level model, which work both for the numbers of one drone and for arrays of all drones. Pure.
+"""Formulas of the rotor-level model, for the numbers of one drone or arrays of all drones. Pure.
 
 Body axes: forward x, left y, up z. The formulas use only sums, products, quotients and square roots, which give
 bit-identical results for numbers and arrays.
@@ -37,7 +37,7 @@ Three: TypeAlias = tuple[N, N, N]
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Constants of one drone, or arrays for all drones. Forces are per mass, and torques per moment of inertia."""
+    """Constants of one drone, or arrays for all drones, in SI units."""
 
     thrust: N
     idle_speed: N
@@ -229,7 +229,7 @@ def advance(
     dq = (t1 * c.x1 + t2 * c.x2 + t3 * c.x3 + t4 * c.x4) * -c.pitch_per_torque - c.gyroscopic_y * p * r
     dr = yaw + twist - c.gyroscopic_z * p * q
     if legs:
-        # The legs exert the supporting force at a lever arm no longer than the hull's radius.
+        # The legs exert the supporting force with a lever arm no longer than the hull's radius.
         load = do.most(knock_z, 0.0)
         roll, pitch = load * c.leg_roll, load * c.leg_pitch
         dp = dp + _within(do, -_LEG_STIFFNESS_PER_S2 * r21 - _LEG_DAMPING_PER_S * p, roll)
@@ -258,10 +258,10 @@ def advance(
 
 
 def mix(do: Operations, c: Constants, rates: Three, speeds: Four, wanted: Three, thrust: N, sag: N) -> Four:
-    """Return the rotor speeds to command in order to turn the body at the wanted rates and produce the wanted thrust.
+    """Return the rotor speeds to command for the wanted body rates and the wanted thrust per mass.
 
-    If the rotors can't do everything, roll and pitch take precedence, followed by the thrust per mass (at 0 the rotors
-    stop). Yaw gets a limited share. ``sag`` is the battery's voltage as a fraction of the full voltage.
+    If the rotors can't do everything, roll and pitch take precedence, then thrust; yaw gets a limited share. Without
+    thrust, the rotors stop. ``sag`` is the battery's voltage as a fraction of the full voltage.
     """
     p, q, r = rates
     want_p, want_q, want_r = wanted

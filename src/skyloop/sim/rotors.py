@@ -83,7 +83,6 @@ class RotorBodies(BodyTable):
     # Inputs ----------------------------------------------------------------------------------------------------
 
     def cut(self, drone: int) -> None:
-        """Stop the rotors, so that the attitude is no longer controlled."""
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
@@ -122,13 +121,11 @@ class RotorBodies(BodyTable):
         self._open_voltage[:] = voltage
 
     def turn(self, drone: int, change_rad_s: float) -> None:
-        """Change a body's turn rate about the vertical."""
         up = self.rotations()[drone, 2]
         self.turning[:, drone] += up * change_rad_s
         self.rates[2, drone] += change_rad_s
 
     def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
-        """Move a body, level and at rest; ``position_m`` has shape (3,), and ``thrust`` is an acceleration [m/s²]."""
         super().put(drone, position_m, yaw_rad, thrust)
         constants = self._constants[drone]
         self._after[:, drone] = 0.0
@@ -140,16 +137,13 @@ class RotorBodies(BodyTable):
     # State -----------------------------------------------------------------------------------------------------
 
     def power(self) -> Floats:
-        """Return each drone's current battery power, (n,) [W]."""
         power: Floats = electric_power(self._all, tuple(self.speeds))
         return power
 
     def body_rates(self) -> Floats:
-        """Return the angular velocities about the bodies' axes, (3, n) [rad/s]."""
         return self.turning.copy()
 
     def body_rates_of(self, drone: int) -> tuple[float, float, float]:
-        """Return a drone's angular velocity about its body's axes [rad/s]."""
         return vec3(self.turning[:, drone])
 
     @property
@@ -158,13 +152,11 @@ class RotorBodies(BodyTable):
         return self.count * PLANT_STEP_S
 
     def rotations(self) -> Floats:
-        """Return world-from-body rotations, (n, 3, 3)."""
         return np.moveaxis(np.array(rotation(*self.quaternion)), 2, 0)
 
     # Steps -----------------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Advance by :data:`~skyloop.sim.dynamics.STEP_S`, without collisions."""
         self._begin()
         for _ in range(PLANT_STEPS):
             for pilot in self._pilots.values():

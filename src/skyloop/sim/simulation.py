@@ -39,7 +39,7 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """A world with drones. All methods may be called from any thread: each step or query holds a lock."""
+    """A world with drones. Its methods may be called from any thread."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class Simulation:
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """Change a drone's limits, starting with the next command. A new ceiling takes effect immediately."""
+        """Change a drone's limits. A set-point in force keeps its values; a new ceiling takes effect at once."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
 
@@ -238,9 +238,9 @@ class Simulation:
             self._batteries.charge[self._number(drone)] = charge
 
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
-        """Move a flying drone, which then hovers level and at rest, to start a new episode in the same simulation.
+        """Move a flying drone, to start a new episode in the same simulation; it hovers there, level and at rest.
 
-        ``position_m`` is the new position of its centre, in world axes. A drone that is not flying raises UsageError.
+        ``position_m`` is the new position of its centre, in world axes. Raises UsageError unless the drone is flying.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -263,7 +263,7 @@ class Simulation:
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """Return a drone's estimates. Altitude and velocity are up to 12 ms older; their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 16 ms older; their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()
@@ -314,7 +314,7 @@ class Simulation:
         """Return the motion of all drones as new arrays, for tasks with many drones.
 
         Positions are true values in world axes, shape (n, 3) [m]; velocities forward, left and up are the drones'
-        estimates, up to 12 ms older, shape (n, 3) [m/s]; roll, pitch and yaw (within ±π) are true, shape (n, 3) [rad].
+        estimates, up to 16 ms older, shape (n, 3) [m/s]; roll, pitch and yaw (within ±π) are true, shape (n, 3) [rad].
         """
         with self._lock:
             angles = self._bodies.angles.T.copy()

@@ -72,8 +72,7 @@ class Solids:
         """Return bounding boxes, low and high, each (3, boxes) [m]. The bounds are valid until the next call.
 
         Moving solids stay within their boxes for ``seconds``, and a hull of ``radius_m`` touches a solid only if their
-        bounding boxes overlap. (To find the distance between a hull and a corner of a turned box, treat the hull as a
-        square turned the same way.)
+        bounding boxes overlap.
         """
         if radius_m != self._bounded_m:
             self._bounded_m = radius_m
@@ -86,6 +85,7 @@ class Solids:
         """Compute the bounding boxes of the given solids, enlarged by this reach on all sides."""
         c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
         x, y, z = self._half[:, which]
+        # For :meth:`overlap`, a hull is a square turned like the box, so it reaches further at the corners.
         corner = (c + s - 1.0) * self._bounded_m + reach_m
         around = np.array([c * x + s * y + corner, s * x + c * y + corner, z + reach_m])
         low, high = self._bounds
@@ -125,7 +125,7 @@ class Solids:
     def overlap(
         self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
     ) -> Overlap | None:
-        """Return a drone's deepest overlap with the room or a solid ``among`` some (None: all), if there is any."""
+        """Return a drone's deepest overlap with the room or the solids ``among`` (None: all); None if it has none."""
         x, y, z = point
         wide, deep, tall = self._room
         deepest, worst = 0.0, None
@@ -156,17 +156,16 @@ class Solids:
         return worst if found < 0 else self._way_out(found, local, inside)
 
     def distance_along(self, point: Vec3, direction: Vec3, time_s: float) -> float:
-        """Return the distance along a unit vector to the first solid at a time, or the floor [m]; infinite if none.
+        """Return the distance [m] along a unit vector to the first solid, floor, or visible wall or ceiling at a time.
 
-        If the point is below the floor, the distance is 0.
+        It is infinite if there is none. A point below the floor counts as on the floor.
         """
         if self._movers:
             self.move(time_s)
         nearest = math.inf
-        bounds = zip(
-            point, direction, (*self._room[:2], self._room[2]), (-self._room[0], -self._room[1], 0.0), strict=True
-        )
-        for axis, (start, way, high, low) in enumerate(bounds):
+        wide, deep, _ = self._room
+        bounds = zip(point, direction, (-wide, -deep, 0.0), self._room, strict=True)
+        for axis, (start, way, low, high) in enumerate(bounds):
             if way < 0.0 and (axis == 2 or self._enclosed):
                 nearest = min(nearest, max(0.0, (low - start) / way))
             elif way > 0.0 and self._enclosed:
@@ -272,7 +271,7 @@ def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids)
         placed = _fill(world, parameters, solids, spawns, margin)
         if len(placed) == len(parameters):
             return placed
-    raise UsageError(f"world {world.name!r} has room for {len(placed)} drones only, not for {len(parameters)}")
+    raise UsageError(f"world {world.name!r} has room for only {len(placed)} drones, not for {len(parameters)}")
 
 
 def _fill(

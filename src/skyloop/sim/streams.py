@@ -40,7 +40,7 @@ def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
 class NormalBlocks:
     """Standard normal random numbers for many drones, ``rows`` per drone at a time. Every drone has its own stream.
 
-    They are drawn in blocks, because one call of a generator costs as much as a hundred numbers.
+    They are drawn for ``ahead`` calls at once, because calling a generator costs as much as drawing a hundred numbers.
     """
 
     def __init__(self, seed: int, purpose: Purpose, rows: int, drones: int, ahead: int = 64) -> None:

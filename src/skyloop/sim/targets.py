@@ -1,4 +1,4 @@
-"""The motion of targets. Each path is a sequence of points on a fixed time grid, which is computed as far as requested.
+"""The motion of targets. Each path is a sequence of points on a fixed time grid, computed as far ahead as requested.
 
 A target's position therefore depends only on the time and the seed.
 """
@@ -39,8 +39,7 @@ GRID_S = 0.02  # spacing of the points, between which motion is linear
 KEPT_S = 60.0  # length of the history that is available for a target
 
 _TURN_BACK = 0.25  # probability that a ring walk reverses at a waypoint
-_RING_STEP_RAD = (math.radians(20), math.radians(45))
-
+_RING_STEP_RAD = (math.radians(20), math.radians(45))  # minimum and maximum angle between waypoints of a ring walk
 
 _Point = tuple[Vec3, float, float]  # position, yaw (not wrapped), distance walked
 

@@ -161,7 +161,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A flat textured rectangle without thickness: a poster, a window, a door. Drones don't collide with the panel."""
+    """A flat textured rectangle without thickness: a poster, a window, a door. Drones don't collide with it."""
 
     name: str
     pose: FacePose
@@ -186,7 +186,7 @@ class MarkerPattern:
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """A printed marker with a fixed pose: the pose of its centre. The top of the marker is the top of the picture."""
+    """A printed marker, with the pose of its centre. The top of the marker is the top of the picture."""
 
     name: str
     pose: FacePose
@@ -195,7 +195,7 @@ class Marker:
 
 @dataclass(frozen=True, slots=True)
 class WaypointPath:
-    """Straight legs between points at a constant speed, in a loop if ``closed``, otherwise back and forth."""
+    """Straight legs between points at a constant speed: a loop if ``closed``, else back and forth."""
 
     points_m: tuple[Vec3, ...]
     speed_m_s: float
@@ -215,7 +215,7 @@ class CirclePath:
 
 @dataclass(frozen=True, slots=True)
 class OvalPath:
-    """A level race track flown at a constant speed: two straights along x joined by half circles, counter-clockwise.
+    """A level race track at a constant speed: two straights along x joined by half circles, counter-clockwise.
 
     It starts ``start_m`` after the beginning of the southern straight, or of the northern one if clockwise.
     """
@@ -276,7 +276,7 @@ Path = WaypointPath | CirclePath | OvalPath | LissajousPath | WalkPath | RingWal
 
 @dataclass(frozen=True, slots=True)
 class FixedYaw:
-    """A heading that is constant."""
+    """A constant heading."""
 
     yaw_rad: float
 
@@ -302,7 +302,7 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:
-    """An upright card with a marker that is carried along a path. Drones can fly through the board.
+    """An upright card with a marker that is carried along a path. Drones can fly through it.
 
     The path describes the card's centre, and the yaw is the heading of the card's face.
     """
@@ -315,7 +315,7 @@ class BoardTarget:
 
 @dataclass(frozen=True, slots=True)
 class PlatformTarget:
-    """A solid slab with a marker on top, moving along a path. Drones can land on the platform.
+    """A solid slab with a marker on top, moving along a path. Drones can land on it.
 
     The path describes the centre of the top face, and the top of the marker points along the platform's heading.
     """
@@ -420,7 +420,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` determines everything random in it (the walks of its targets)."""
+    """A whole world. ``seed`` determines everything random in it: its layout, the walks of its targets, its light."""
 
     name: str
     room: Room
@@ -468,5 +468,5 @@ def geometry_of(world: World) -> WorldGeometry:
 
 
 def _rounded(place: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Round to millimetres to keep the text short."""
+    """Round to millimetres, to keep the encoded geometry short."""
     return round(place[0], 3), round(place[1], 3), round(place[2], 3)

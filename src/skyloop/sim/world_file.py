@@ -83,7 +83,7 @@ RingRadius = Annotated[float, Meta(ge=0.1)]
 RingHeight = Annotated[float, Meta(ge=0.0)]
 TurnRate = Annotated[float, Meta(ge=1.0, le=720.0)]
 #: The ID of a marker; the dictionary determines which IDs are valid.
-MarkerId = Annotated[Any, Meta(description="a whole number, a marker's in its dictionary")]
+MarkerId = Annotated[Any, Meta(description="a whole number, the id of a marker in its dictionary")]
 
 
 class _Table(Struct, forbid_unknown_fields=True):
@@ -133,7 +133,7 @@ class GateTable(VariedTable, kw_only=True):
 
 
 class FaceTable(Named, kw_only=True):
-    """Position specified by two coordinates on a face of the room, or by a point and a heading."""
+    """A position: two coordinates on a face of the room, or a point and a heading."""
 
     on: Mount | None = None
     at: Spot | None = None
@@ -401,7 +401,7 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
     turn = math.radians(table.turn_deg)
     if table.on is None:
         if table.at is not None:
-            raise place.error("at", "unknown without 'on', the face of the room")
+            raise place.error("at", "needs 'on', the face of the room")
         if table.position is None:
             raise place.error("position", "missing; give a list of 3 numbers, or 'on' and 'at'")
         _require_inside(place, "position", table.position, room)
@@ -409,7 +409,7 @@ def _face(table: FaceTable, room: Room, place: Place) -> FacePose:
         return FacePose(table.position, yaw, elevation, turn)
     for key in ("position", "yaw_deg", "elevation_deg"):
         if getattr(table, key) is not None:
-            raise place.error(key, "unknown together with 'on', which mounts it flat on a face of the room, at 'at'")
+            raise place.error(key, "can't be combined with 'on', which fixes the object's pose")
     if table.at is None:
         raise place.error("at", "missing; it must be a list of 2 numbers")
     pose = _mounted(table.on, *table.at, turn, room)
@@ -574,7 +574,7 @@ def place_varied(table: WorldTable, seed: int, place: Place) -> None:
             break
     else:
         raise place.under("vary").error(
-            "apart", f"no room was found for {len(things)} things at {table.vary.apart:g} m from each other"
+            "apart", f"no room for {len(things)} objects at least {table.vary.apart:g} m apart"
         )
     for thing, (x, y, z) in zip(things, places, strict=True):
         if isinstance(thing, BoxTable) and thing.stands_at is not None:

@@ -113,7 +113,7 @@ class _RehearsalDriver(SimDriver):
         self._clock = clock
         self._random = random.Random(f"rehearsal/{radio.seed}")
         # Cameras use a separate generator, so that they do not affect which commands and feedback are lost.
-        self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
+        self._picture_random = random.Random(f"rehearsal/pictures/{radio.seed}")
         self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap ordered by arrival time
         self._numbers = itertools.count()
 
@@ -127,7 +127,7 @@ class _RehearsalDriver(SimDriver):
         return min(step_ns, self._on_the_way[0][0])
 
     def step(self) -> None:
-        """Do the work that is due, starting with arrivals."""
+        """Deliver the next arrival if it is due, or else advance the world."""
         assert isinstance(self.host, SteppedHost)
         if self._on_the_way and self._on_the_way[0][0] <= self._clock.now_ns:
             heapq.heappop(self._on_the_way)[2]()
@@ -144,7 +144,7 @@ class _RehearsalDriver(SimDriver):
         def arrive() -> None:
             SimDriver.show(self, model, pixels, captured_ns)
 
-        self._send(self._radio.picture_delay_s, arrive, self._of_pictures)
+        self._send(self._radio.picture_delay_s, arrive, self._picture_random)
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
         self._send(self._radio.command_delay_s, lambda: self._arrive(host, action), self._random)
@@ -178,9 +178,6 @@ class _NoisySink:
         return getattr(self._sink, name)
 
 
-_STEPS = round(TICK_S / STEP_S)
-
-
 class SteppedHost(SimHost):
     """A :class:`SimHost` without threads.
 
@@ -189,7 +186,7 @@ class SteppedHost(SimHost):
     """
 
     def __init__(self, options: SimOptions, clock: Clock, drones: int = 1) -> None:
-        """Initialise the world; the caller moves the clock to :attr:`due_ns` before each step."""
+        """Load the world; the caller moves the clock to :attr:`due_ns` before each step."""
         super().__init__(options, drones)
         self._clock = clock
         self._manual_stepper: _ManualStepper | None = None
@@ -222,7 +219,7 @@ class _ManualStepper:
         self.due_ns = clock() + nanoseconds(TICK_S)
 
     def step(self) -> None:
-        self._host.simulation.step(_STEPS)
+        self._host.simulation.step(round(TICK_S / STEP_S))
         self._publisher.publish(self.due_ns)
         if self._pipeline is not None:
             self._pipeline.hand_out(self.due_ns)

@@ -18,17 +18,13 @@ from skyloop.stepping.transport import StepExecutor, SteppedServer, StepSchedule
 from skyloop.transport.base import Dialer
 from skyloop.vehicles.replay.driver import ReplayDriver
 
-LEAD_NS: Final = NS_PER_S  #: time between the clock's start and the recording's start, for a few ticks to connect
+LEAD_NS: Final = NS_PER_S  #: the clock starts this long before the recording, so that the application can connect
 
 
 def connector(uri: str) -> SteppedReplay | None:
-    """Create a stepped replay. The entry point ``replay`` in the group ``skyloop.connectors``.
+    """Return a stepped replay if the address has ``speed=max``, or None to have a private proxy serve the address.
 
-    Args:
-        uri: The address, ``replay://…``.
-
-    Returns:
-        The replay if the address contains ``speed=max``; None for other addresses, which a private proxy serves.
+    This is the entry point ``replay`` in the group ``skyloop.connectors``.
 
     Raises:
         UsageError: The address or the recording is invalid.
@@ -41,7 +37,6 @@ class SteppedReplay:
     """The proxy of a replay, and the simulated time that the proxy shares with its only application."""
 
     def __init__(self, driver: ReplayDriver) -> None:
-        """Start the proxy."""
         self.reach = None
         self._executor = StepExecutor("skyloop-stepping")
         try:
@@ -59,8 +54,8 @@ class SteppedReplay:
         self._server = server
         self._ended = False
 
-    def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (the proxy is already serving)
-        """Return a dialer for the proxy, which already accepts clients."""
+    def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002
+        """Return a dialer for the proxy, which is serving already."""
         return self._server.dial
 
     def close(self) -> None:

@@ -41,7 +41,6 @@ class StepExecutor:
     """A thread that runs everything except the application's own code, in the order in which it is posted."""
 
     def __init__(self, name: str) -> None:
-        """Start the thread."""
         self._jobs: SimpleQueue[Job | None] = SimpleQueue()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -90,7 +89,7 @@ class StepExecutor:
             except Empty:
                 return
             if job is None:
-                self._jobs.put(None)
+                self._jobs.put(None)  # which ends the thread later
                 return
             _run_logged(job)
 
@@ -109,7 +108,7 @@ def _run_logged(job: Job) -> None:
     try:
         job()
     except Exception:  # noqa: BLE001 (the next step may succeed)
-        _log.exception("a step of a replay failed")
+        _log.exception("a step in simulated time failed")
 
 
 ADDRESS: Final = "this process, in step with one application"
@@ -125,7 +124,10 @@ class SteppedServer(TransportServer):
         self._number = 0
 
     def dial(self, handler: ClientHandler) -> TransportClient:
-        """Connect a client; its handler runs on the executor's thread. LinkError if there is one, or after a stop."""
+        """Connect the only client; its handler runs on the executor's thread.
+
+        Raises LinkError if a client is connected already, or the server has been stopped.
+        """
         server = self._handler
         if server is None:
             raise LinkError("the replay has ended")
@@ -264,7 +266,7 @@ class SteppedClient(TransportClient):
 
 AFTER_NS: Final = 60 * NS_PER_S  #: a wait without a time limit gives up this long after the end of the recording
 _TICK_NS: Final = nanoseconds(PERIOD_S)
-_NEVER_NS: Final = 1 << 62
+_NEVER_NS: Final = 1 << 62  # later than any time of the clock
 
 
 class StepSource(Protocol):
@@ -307,15 +309,12 @@ class StepScheduler(Scheduler):
         self._interrupted = False
 
     def notifier(self) -> Notifier:
-        """Return a notifier whose waits advance simulated time."""
         return StepNotifier(self)
 
     def sample_notifier(self, connection: ProxyConnection) -> Notifier:  # noqa: ARG002
-        """Return a notifier whose waits advance simulated time."""
         return StepNotifier(self)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
-        """Store the connection's supervisor, to be called as time advances."""
         self._supervisor = supervisor
 
     def opened(self) -> None:
@@ -324,14 +323,14 @@ class StepScheduler(Scheduler):
         self._begun = True
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None, sleep: Callable[[], bool]) -> bool:
-        """Advance simulated time until ``ready()`` is true; it is evaluated after each step on the executor's thread.
+        """Advance simulated time until ``ready()``, evaluated on the executor's thread after each step, is true.
 
         If another thread is already advancing time, the calling thread just waits in ``sleep()``, in real time. The
-        limit is in simulated time; None means wait until 60 s after the end of the recording. On the executor's thread,
-        for example in an inline callback, UsageError is raised.
+        limit is in simulated time; None means wait until 60 s after the end of the recording. Raises UsageError on the
+        executor's thread, for example in an inline callback.
         """
         if self._executor.is_current:
-            raise UsageError("a callback in step with the recording can't wait for the next sample")
+            raise UsageError("a callback can't wait for the next sample: time does not advance until it returns")
         if not self._turn.acquire(blocking=False):
             return sleep()
         try:
@@ -395,12 +394,11 @@ class StepNotifier(Notifier):
     __slots__ = ("_scheduler",)
 
     def __init__(self, scheduler: StepScheduler) -> None:
-        """Store the scheduler."""
         super().__init__()
         self._scheduler = scheduler
 
     def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
-        """Wait until ``ready()`` is true; it is evaluated after each step. Return whether it became true in time."""
+        """Wait until ``ready()``, evaluated after each step, is true; return whether it became true in time."""
         return ready() or self._scheduler.wait_for(
             ready, timeout_s, lambda: super(StepNotifier, self).wait_for(ready, timeout_s)
         )

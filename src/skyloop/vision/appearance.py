@@ -102,7 +102,7 @@ class LongTermTracker(Tracker):
             self._tracker.shift(right, down)
 
     def similarity(self, image: Image, box: Sequence[float]) -> float:
-        """Return how similar a box's content is to the target, 0 to 1; 0 if a known look-alike fits better.
+        """Return how similar a box's content is to the target, 0 to 1; 0 if a known look-alike fits clearly better.
 
         Args:
             image: As in :meth:`update`.
@@ -273,7 +273,6 @@ class TargetMemory:
     """
 
     def __init__(self, cv: Any, image: Image, box: Box) -> None:
-        """Remember the first appearance."""
         self._cv = cv
         self._appearances = [Appearance.of(cv, image, box)]
         self._look_alikes: list[Appearance] = []
@@ -293,9 +292,9 @@ class TargetMemory:
         _add(self._look_alikes, Appearance.of(self._cv, image, box), keep_first=False)
 
     def search(self, image: Image, size: tuple[float, float], *, besides: Box | None = None) -> list[Candidate]:
-        """Search the whole image for the target [px], using a different one of its appearances each time.
+        """Search the whole image for the target at a size [px], using a different one of its appearances each time.
 
-        Return up to three of the best places, most similar first. Their overlap with ``besides`` is less than a tenth.
+        Return the best places, at most three, most similar first, without those that overlap ``besides`` by a tenth.
         """
         shrink = min(1.0, _SEARCHED_PX / math.sqrt(size[0] * size[1]))
         rows, columns = image.shape[:2]

@@ -27,7 +27,7 @@ from skyloop.vision.lens import Array
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 Kind = Literal["charuco", "chessboard"]
-MM_PER_INCH = 25.4
+MM_PER_INCH = 25.4  # exact by definition
 _MARKER_SHARE = 0.74  # marker's side as a fraction of the square's side
 _LEAST_CORNERS = 8  # minimum number of a ChArUco board's corners in an image
 Model = Literal["pinhole", "fisheye"]
@@ -115,7 +115,7 @@ class Board:
             dpi: Resolution, which is adjusted slightly so that a square has an integer number of pixels.
 
         Raises:
-            UsageError: The file name has a different ending, or a square would not have 20 to 2000 pixels.
+            UsageError: The file name has a different ending, or a square is smaller than 20 pixels or larger than 2000.
             MissingExtraError: Pillow or OpenCV is not installed.
         """
         file = Path(path)
@@ -223,7 +223,7 @@ class Collector:
     def __init__(self, width: int, height: int) -> None:
         """Initialise an empty collection for images of a fixed size [px]."""
         self.views: list[BoardView] = []
-        self.size = (width, height)  #: width and height of the images [px]
+        self.size = (width, height)
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:

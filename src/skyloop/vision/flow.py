@@ -46,7 +46,7 @@ class GroundTracker:
         self._offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m, np.float64)
         self._grey: NDArray[np.uint8] | None = None
         self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
-        self._ground = np.empty((0, 2))  # positions of the corners on the ground, in the same axes as `place`
+        self._ground = np.empty((0, 2))  # positions of the corners on the ground, in the same axes as ``place``
         self.place = np.zeros(2)  #: the vehicle's position at the last frame: along yaw 0 and to the left [m]
 
     @property
@@ -70,8 +70,8 @@ class GroundTracker:
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners. None for the first frame, if too
-            few corners were found again, or if the attitude or height is unknown; tracking then restarts at the last
-            position.
+            few corners were found again, if the attitude or height is unknown, or below 0.15 m; tracking then restarts
+            at the last position.
 
         Raises:
             UsageError: The array has a wrong shape or type, or there are no intrinsics.
@@ -137,6 +137,6 @@ class GroundTracker:
         turn = at_capture.rotation
         level = np.column_stack([rays, np.ones(len(rays))]) @ (turn @ self._mounting).T
         lever = turn @ self._offset
-        good = level[:, 2] < -0.2
+        good = level[:, 2] < -0.2  # rays closer to the horizon would amplify errors of the attitude
         depth = np.where(good, -((at_capture.altitude_m or 0.0) + lever[2]) / np.where(good, level[:, 2], 1.0), 0.0)
         return level[:, :2] * depth[:, None] + lever[:2], good

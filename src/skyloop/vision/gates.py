@@ -53,7 +53,7 @@ class ColourMask:
         self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
 
     def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return the mask (h, w), uint8, of a BGR image (h, w, 3): 255 where the pixel has the colour, otherwise 0."""
+        """Return the mask (h, w), uint8, of a BGR image (h, w, 3): 255 where the pixel has the colour, else 0."""
         cv = self._cv
         hsv = cv.cvtColor(cv.GaussianBlur(pixels, (3, 3), 0), cv.COLOR_BGR2HSV)
         reach = round(_HUE_DEG / 2)  # OpenCV's hue has 180 steps per turn
@@ -69,7 +69,7 @@ class BlobSighting:
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: angle of the left edge from the optical axis, positive to the left
-    right_rad: float  #: angle of the right edge with the same sign convention, smaller than `left_rad`
+    right_rad: float  #: angle of the right edge with the same sign convention, smaller than ``left_rad``
 
     @property
     def bearing_rad(self) -> float:
@@ -201,7 +201,7 @@ class GateDetector:
         if rays is None:
             return None
         pose = PlanarPose.of(self._cv, self._outline, rays, self._cv.SOLVEPNP_IPPE)
-        if pose is None or pose.position[2] > _FARTHEST_M or pose.rotation[1, 1] > -0.7:  # upright in the image
+        if pose is None or pose.position[2] > _FARTHEST_M or pose.rotation[1, 1] > -0.7:  # its top is over 45° from up
             return None
         corners = project(np.column_stack([rays, np.ones(len(rays))]), intrinsics)
         return GateSighting(corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)

@@ -30,8 +30,8 @@ def checked(
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
     """Check an image; return its pixels as a plain array and its intrinsics, which default to the frame's own.
 
-    It is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. Raise UsageError
-    if the shape or type is wrong, the array is empty, or the intrinsics are missing.
+    The image is a :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey. Raises
+    UsageError if the shape or type is wrong, the array is empty, or the intrinsics are missing.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -60,8 +60,8 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
         intrinsics: Intrinsics of the camera.
 
     Returns:
-            Pixels (n, 2); NaN for points that the model can't show: not in front of a pinhole camera or beyond
-            the angle at which the lens polynomial turns back.
+        Pixels (n, 2); NaN for points that the model can't show: those not in front of a pinhole camera, and those
+        beyond the angle at which the lens's polynomial turns back.
 
     Raises:
         UsageError: The shape is wrong, or the model is unknown.

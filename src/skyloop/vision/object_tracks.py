@@ -153,7 +153,7 @@ class ObjectTracks:
         self._next = 1
 
     def update(self, detections: Sequence[Detection], time_s: float) -> list[TrackedObject]:
-        """Match the next image's detections and return all objects by number, including those not seen in this image.
+        """Match the next image's detections; return the confirmed objects by number, including those not seen in it.
 
         Args:
             detections: Detections in one image; empty and non-finite ones are ignored.

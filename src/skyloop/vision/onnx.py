@@ -14,7 +14,7 @@ from typing import Any, Final
 from skyloop.errors import FileFormatError, MissingExtraError
 
 CPU_S: Final = 20  #: limit of CPU time for loading a network and running it once
-MEMORY: Final = 4 << 30  #: limit of address space in bytes, in addition to four times the file's size
+MEMORY: Final = 4 << 30  #: limit of the address space [bytes], on top of four times the file's size
 _WAIT_S: Final = 300.0  # wall-clock limit, long enough for a busy computer
 _REFUSED: Final = 3  # exit code of a child that printed the reason
 _OWN: Final = Path(__file__).with_name("weights")
@@ -56,7 +56,7 @@ def _session(onnxruntime: Any, path: Path | str, threads: int) -> Any:
 def try_alone(*files: Path | str, tracker: str = "") -> None:
     """Load and run a network in a child process within limits, or raise FileFormatError.
 
-    An OpenCV tracker takes one or two files and a name; if there is no name, ONNX Runtime loads the file.
+    ``tracker`` names the OpenCV tracker that loads the one or two files; without it, ONNX Runtime loads the file.
     """
     path, job = ", ".join(map(str, files)), "\n".join(map(str, (tracker, *files)))
     command = [sys.executable, "-c", _CHILD, str(CPU_S), job, *(one for one in sys.path if isinstance(one, str))]
@@ -88,12 +88,13 @@ def run_alone(cpu_s: int, tracker: str, *files: str) -> None:
             resource.setrlimit(kind, (limit, limit))
     try:
         run = _tracker(tracker, files) if tracker else _network(files[0])
-    except Exception as error:  # noqa: BLE001 raised again in the parent
+    except Exception as error:  # noqa: BLE001 the parent raises it
         print(reason(error))
         sys.exit(_REFUSED)
     try:
         run()
     except Exception as error:
+        # The shapes of the zeros are partly guessed, so only an error about memory says anything about the network.
         if isinstance(error, MemoryError) or "alloc" in str(error).lower():
             raise
 
@@ -137,4 +138,5 @@ def load_tracker(cv: Any, name: str, files: Sequence[str]) -> Any:
 
 def reason(error: Exception) -> str:
     """Return an exception's text, shortened and on one line."""
-    return " ".join(str(error).split())[:300]  # OpenCV keeps `err` on the class; it holds the last error anywhere
+    # Not error.err, which OpenCV keeps on the class, so that it holds the last error raised anywhere.
+    return " ".join(str(error).split())[:300]

@@ -77,7 +77,7 @@ def describe(outputs: Outputs) -> str:
 
 
 def tell_layout(outputs: Outputs, width: int, height: int, classes: int | None = None) -> Layout:
-    """Recognise a network's layout from its named outputs in one run on any image, and the size of its input.
+    """Recognise a network's layout from the size of its input and the named outputs of one run on any image.
 
     Raises FileFormatError if the outputs fit no family or several. ``classes`` is the number of class names.
     """
@@ -133,29 +133,21 @@ def class_count(layout: Layout, outputs: Outputs) -> int | None:
 
 
 def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
-    """Decode a network's outputs into boxes, scores and classes. Rows with non-finite values pass unchanged.
+    """Decode a network's outputs, given the size of its input [px]. Rows with non-finite values pass unchanged.
 
-    Args:
-        layout: Layout of the outputs.
-        outputs: Outputs by name.
-        width: Width of the network's input [px].
-        height: Height of the network's input [px].
-
-    Raises:
-        FileFormatError: The shapes of the outputs don't match the layout.
+    Raises FileFormatError if the outputs' shapes don't match the layout.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # hostile numbers become infinite and are dropped later
         if layout is Layout.LISTS:
             boxes, scores, labels = _lists(outputs)
-            finite = np.where(np.isfinite(labels), labels, -1.0)
-            return Found(boxes, scores, _whole(finite))
+            return Found(boxes, scores, _whole(labels))
         if layout in (Layout.DETR, Layout.RF_DETR):
             shares, certainties = _pair(outputs)
             return _shared(_numbers(shares)[0], _as_scores(_numbers(certainties)[0]), width, height)
         rows = _numbers(_single(outputs, layout))[0]
         if layout is Layout.END_TO_END:
             _columns(rows, 6, layout, outputs, exactly=True)
-            return Found(rows[:, :4], rows[:, 4], _whole(np.where(np.isfinite(rows[:, 5]), rows[:, 5], -1.0)))
+            return Found(rows[:, :4], rows[:, 4], _whole(rows[:, 5]))
         if layout is Layout.YOLO8 and rows.shape[0] < rows.shape[1]:
             rows = rows.T
         if layout in (Layout.RT_DETR, Layout.YOLO8):
@@ -173,8 +165,8 @@ def decode(layout: Layout, outputs: Outputs, width: int, height: int) -> Found:
 
 def _unknown(outputs: Outputs) -> FileFormatError:
     return FileFormatError(
-        f"its outputs ({describe(outputs)}) have no known layout: one output of YOLOv5 to v11, YOLOX or RT-DETR, "
-        "boxes and logits of a DETR, or boxes, scores and labels; for bare detection, one image at a time. "
+        f"its outputs ({describe(outputs)}) have no known layout: they must be one output of YOLOv5 to v11, YOLOX or "
+        "RT-DETR, boxes and logits of a DETR, or boxes, scores and labels, of one image, without masks or keypoints. "
         "If they are ambiguous, give layout=, one of " + ", ".join(each.value for each in Layout)
     )
 
@@ -241,7 +233,7 @@ def _shares(boxes: Floats) -> bool:
 
 
 def _as_scores(values: Floats) -> Floats:
-    """Return scores unchanged and logits through a sigmoid; values outside 0 to 1 mean logits."""
+    """Return scores unchanged, but logits after a sigmoid; values outside 0 to 1 mean logits."""
     finite = values[np.isfinite(values)]
     if len(finite) and (finite.min() < 0.0 or finite.max() > 1.0):
         return np.asarray(1.0 / (1.0 + np.exp(-values)), np.float64)
@@ -266,7 +258,9 @@ def _surest(corners: Floats, scores: Floats) -> Found:
 
 
 def _whole(labels: Floats) -> NDArray[np.int64]:
-    return np.clip(np.round(labels), -1, 1e6).astype(np.int64)
+    """Return class numbers; -1 for labels that are not finite, whose rows are dropped later."""
+    finite = np.where(np.isfinite(labels), labels, -1.0)
+    return np.clip(np.round(finite), -1, 1e6).astype(np.int64)
 
 
 def _grid(rows: int, width: int, height: int, outputs: Outputs) -> tuple[Floats, Floats]:
@@ -301,7 +295,7 @@ def _decoded(rows: Floats, width: int, height: int) -> bool:
 
 
 def layout_named(name: str | Layout | None) -> Layout | None:
-    """Check a layout's name."""
+    """Return the layout with this name; raise UsageError if there is none."""
     if name is None:
         return None
     try:
@@ -478,7 +472,8 @@ class OnnxDetector:
         shape = list(first.shape)
         if len(shape) != 4 or first.type not in _TYPES or (shape[1] not in (3, None) and not isinstance(shape[1], str)):
             raise FileFormatError(
-                f"{self._path} has the input {shown} and must have (1, 3, height, width) of float, float16 or uint8"
+                f"{self._path} has the input {shown} and must have one of shape (1, 3, height, width) and type float, "
+                "float16 or uint8"
             )
         if isinstance(shape[0], int) and shape[0] != 1:
             raise FileFormatError(f"{self._path} takes {shape[0]} images at a time: export it for batches of 1")

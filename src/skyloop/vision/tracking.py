@@ -244,7 +244,7 @@ _LEVELS: Final = 3  # number of levels of its image pyramid
 _AROUND: Final = (9, 9)  # size of a point's surroundings to compare [px]
 _ENOUGH: Final = 6  # minimum number of points
 _RETURN_PX: Final = 5.0  # maximum median distance after tracking back; tracking fails above it
-_SPREAD_PX: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
+_SPREAD_SHARE: Final = 0.35  # maximum spread of the displacements, as a fraction of the box's smaller side
 _SMALLEST_PX: Final = 6.0  # minimum side of the box, below which tracking fails
 
 
@@ -276,12 +276,11 @@ class _Filter:
 
 
 class CorrelationTracker(Tracker):
-    """Tracks a target's position and size with correlation filters. This tracker is fast, and it is the default.
+    """Tracks a target's position and size with correlation filters. Fast; :class:`LongTermTracker` uses it by default.
 
     It follows a target that changes slowly and moves by less than half its size between images. The score is the height
     of the correlation peak: about 1 for the image that it was learned from. Below ``lost_below`` the target counts as
-    lost, and it is searched for where it was last seen. For loss detection, memory and search, see
-    :class:`LongTermTracker`.
+    lost, and is searched for only where it was last seen; :class:`LongTermTracker` searches the whole image.
     """
 
     def __init__(self, *, lost_below: float = 0.3, learn_above: float = 0.4) -> None:
@@ -450,7 +449,7 @@ class MedianFlowTracker(Tracker):
         moved = after - before
         shift = np.median(moved, axis=0)
         spread = float(np.median(np.linalg.norm(moved - shift, axis=1)))
-        if back > _RETURN_PX or spread > _SPREAD_PX * min(box[2:]) or len(before) < 2:
+        if back > _RETURN_PX or spread > _SPREAD_SHARE * min(box[2:]) or len(before) < 2:
             return None, 0.0
         scale = _stretch(before, after)
         width, height = box[2] * scale, box[3] * scale

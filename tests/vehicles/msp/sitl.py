@@ -15,7 +15,7 @@ from typing import IO, Final
 from skyloop.vehicles.msp.wire.frames import Frame, encode
 from skyloop.vehicles.msp.wire.messages import Function
 from skyloop.vehicles.sim.firmware.betaflight import connected, program_path
-from skyloop.vehicles.sim.firmware.keeper import become_prompt
+from skyloop.vehicles.sim.firmware.keeper import request_real_time
 
 MSP_PORT: Final = 5761  # all its ports are constants
 _STATE, _MOTORS = 9003, 9002
@@ -66,7 +66,7 @@ class Sitl:
                 cwd=self._folder,
                 stdout=self._log,
                 stderr=subprocess.STDOUT,
-                preexec_fn=become_prompt,  # noqa: PLW1509  the feeder's thread does not run yet
+                preexec_fn=request_real_time,  # noqa: PLW1509  the feeder's thread does not run yet
             )
             with suppress(OSError):
                 connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>").close()

@@ -42,13 +42,14 @@ KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with the functions from ``kernels``. See :class:`Painter`."""
+    """Draws with the functions from ``kernels``."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
         grid = raster.grid
         self._do = functions
         texels = atlas.image.view(np.int32)
+        # An overlapping view, in which each number is a texel and the next one.
         self._pairs = np.ndarray((texels.size - 1,), np.int64, texels.data, 0, (4,))
         self._grid = np.array([grid.width, grid.height, grid.fx, grid.fy, grid.cx, grid.cy], dtype=np.float64)
         self._fixed: tuple[NDArray[np.intp], Floats, Floats] | None = None
@@ -60,7 +61,6 @@ class CompiledPainter(Painter):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
         if self._fixed is None or self._fixed[0] is not quads.texture:  # these do not change while parts move
             weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
@@ -153,7 +153,7 @@ class Compiler:
             return self._thread
 
     def _hold(self, process: int) -> None:
-        """Block further compilation permanently: after a fork, neither the thread nor a usable lock exists."""
+        """Block further compilation permanently, unless this is a forked child, which has no usable lock."""
         if process == os.getpid():
             self._compiling.acquire()
 

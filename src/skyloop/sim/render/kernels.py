@@ -169,7 +169,7 @@ def draw(
     # the image's memory, read as one number per pixel except the last, at intervals of three bytes
     packed: NDArray[np.int32],
 ) -> None:
-    """Draw the same image as ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+    """Draw the same image as ``PlainPainter`` with ``DepthBuffer``, ``Shader`` and ``darken``.
 
     For each band of the grid, find the nearest quad at each sample. Then colour the image rows that depend on no
     further bands, while this band is still in the cache.

@@ -180,7 +180,7 @@ def _car(atlas: AtlasBuilder, target: FigureTarget) -> Figure:
 def _cabin(
     shapes: QuadBuilder, low: Vec3, roof: Vec3, bottom: float, top: float, textures: tuple[Texture, Texture, Texture]
 ) -> None:
-    """Add a cabin with slanted sides. ``low``, ``roof``: x from, x to, ±y. Textures: of ends, of sides, of the roof."""
+    """Add a cabin with slanted sides. ``low`` and ``roof`` are x from, x to, ±y; textures: of ends, sides and roof."""
     (a0, a1, b), (c0, c1, d) = low, roof
     under = [np.array(p) for p in ((a0, -b, bottom), (a1, -b, bottom), (a1, b, bottom), (a0, b, bottom))]
     over = [np.array(p) for p in ((c0, -d, top), (c1, -d, top), (c1, d, top), (c0, d, top))]
@@ -281,8 +281,7 @@ HULLS: tuple[Rgb, ...] = (
     (150, 96, 220),
 )
 DRONE_RADIUS_M = 0.26  #: distance from the centre to the outermost point of a rotor
-_ARM_M = 0.16
-_ROTOR_M = 0.10
+_ARM_M, _ROTOR_M = 0.16, 0.10  # distance of the rotors' axes from the centre, and radius of a rotor
 _FEET_M = 0.06  # distance of the feet below the body's origin
 _DARK: Rgb = (46, 48, 52)
 _POLE_M = 12.0  # length of the stand's pole, which extends through the floor and is hidden below it
@@ -386,7 +385,7 @@ def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
 
 
 _CELL = 24  # number of texels per cell of the marker
-_PAPER = 235
+_PAPER, _INK = 235, 22  # grey values of a card's white and black
 
 
 def draw_card(pattern: MarkerPattern) -> tuple[Image, tuple[float, float, float, float]]:
@@ -406,7 +405,7 @@ def draw_card(pattern: MarkerPattern) -> tuple[Image, tuple[float, float, float,
     margin = pattern.margin_m / pattern.size_m * black
     border = int(np.ceil(margin)) + 2
     square = cv2.aruco.generateImageMarker(dictionary, pattern.marker_id, black, borderBits=1)
-    ink = np.where(square > 127, _PAPER, 22).astype(np.uint8)
+    ink = np.where(square > 127, _PAPER, _INK).astype(np.uint8)
     image = cv2.copyMakeBorder(ink, border, border, border, border, cv2.BORDER_CONSTANT, value=_PAPER)
     start, end = border - margin, border + black + margin
     return np.repeat(image[..., None], 3, axis=2).astype(np.uint8), (start, start, end, end)

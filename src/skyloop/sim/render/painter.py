@@ -1,6 +1,6 @@
 """Drawing of images: the sample positions for a lens, and a painter that uses only NumPy and OpenCV.
 
-It is used until compilation finishes, or permanently if compiled code is not available.
+This painter is used until the compiled one is ready, or permanently if Numba is not available.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Painter(ABC):
 
 
 class PlainPainter(Painter):
-    """Draws with NumPy and OpenCV. See :class:`Painter`."""
+    """Draws with NumPy and OpenCV."""
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas) -> None:
         super().__init__(raster, model, atlas)
@@ -109,7 +109,6 @@ class PlainPainter(Painter):
     def paint(
         self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
     ) -> None:
-        """See :meth:`Painter.paint`."""
         view = visible_quads(quads, shown, pose, self.raster.grid)
         self._buffer.draw(view, quads.priority[view.index])
         seen = self._buffer.seen.reshape(-1)
@@ -142,4 +141,4 @@ class PlainPainter(Painter):
         samples = np.empty((len(places), 4), np.uint8)
         self._shader.shade(table, seen[places], ray_x, ray_y, samples, np.empty(len(places), np.float32))
         total = samples.reshape(4, -1, 4).sum(axis=0, dtype=np.uint16)
-        colours[pixels] = total + 2 >> 2
+        colours[pixels] = total + 2 >> 2  # the rounded mean

@@ -63,7 +63,7 @@ class PlanarRenderer:
     """Renders an ideal sensor's image behind a camera's lens, with distortion but without noise, blur or vignetting.
 
     :class:`SensorEffects` adds noise, blur and vignetting. The renderer reuses buffers, so it must be used from one
-    thread at a time. Several renderers can share a scene. If there is no compiler, it never draws with compiled code.
+    thread at a time. Several renderers can share a scene. With ``compiler`` None, it never draws with compiled code.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class PlanarRenderer:
         if out is None:
             out = np.empty(shape, np.uint8)
         elif out.shape != shape or out.dtype != np.uint8:
-            raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's image is uint8 of {shape}")
+            raise UsageError(f"out has shape {out.shape} and type {out.dtype}, and must have {shape} and uint8")
         self._sample(state, pose, model, out)
         if state.light != 1.0:
             dimmed(out, state.light)
@@ -173,7 +173,9 @@ class SensorEffects:
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
-            raise UsageError(f"camera {model.name!r} gives {model.width}x{model.height}; this is {picture.shape}")
+            raise UsageError(
+                f"camera {model.name!r} has {model.width}x{model.height} pixels, the image {picture.shape}"
+            )
         if body_rates_rad_s is not None:
             self._smear(picture, body_rates_rad_s)
         if self._gain is not None:

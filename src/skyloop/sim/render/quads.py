@@ -39,7 +39,7 @@ class SceneState:
     light: float = 1.0
 
 
-LEVELS = 7
+LEVELS = 7  # sizes of each texture: the full one, and six that are each half as large
 BORDER = 4  # pixels repeated around each level, so that interpolation at the edge stays within the level
 GAP = 2 * BORDER
 _STEP = 1 << (LEVELS - 1)  # padded sizes are multiples of this step, so that every level can be halved exactly
@@ -57,7 +57,7 @@ class Texture:
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """All textures in one image."""
+    """All textures in one image. Level k of a texture starts at column x0 + span (1 - 2^-k) + GAP k."""
 
     image: NDArray[np.uint8]  #: the image in BGRA (OpenCV samples four channels twice as fast as three)
     x0: NDArray[np.float64]  #: column where each texture's level 0 starts; float64, shape (number of textures,)
@@ -132,8 +132,8 @@ _CORNERS = 4  # number of corners, a quad's first vectors; the normal and the sl
 class Quads:
     """``n`` flat convex quadrilaterals. A triangle is stored with one corner repeated.
 
-    Texel u of a point X in the plane is ``u_slope · X + u_start``, and likewise for v. u points right and v points
-    down, both measured from the texture's top left corner.
+    The texel of a point X in the plane is u = ``u_slope · X + u_start`` to the right and v = ``v_slope · X + v_start``
+    down from the texture's top left corner.
     """
 
     vectors: Floats  #: corners, normal, slopes of u and of v, in one array to move them together, (n, 7, 3)
@@ -273,8 +273,8 @@ class QuadBuilder:
     ) -> None:
         """Add an upright box that is visible from outside and extends from its lowest to its highest corner [m].
 
-        A pair of ``sides`` holds the textures of the faces normal to x and to y; ``ends`` is for top and bottom, by
-        default the texture along x.
+        A pair of ``sides`` holds the textures of the faces normal to x and to y; ``ends`` is for top and bottom, and by
+        default the texture of the faces normal to x.
         """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0

@@ -22,7 +22,7 @@ _FADES_AT_M = 4.0  # height above a surface at which a drone's shadow has faded 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """All parts of a scene at a point in time. ``drone``: the drone to whose body a quad belongs, or -1, (n,)."""
+    """All parts of a scene at a point in time. ``drone``: the drone that each quad belongs to, or -1, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]
@@ -178,7 +178,7 @@ def _surface(atlas: AtlasBuilder, name: str, width_m: float, height_m: float, de
 
 
 def _shell(world: World, atlas: AtlasBuilder, shadowing: tuple[Box, ...]) -> Quads:
-    """Add floor, walls and ceiling, or ground and sky. ``shadowing``: boxes whose shadows are painted on the floor."""
+    """Return floor, walls and ceiling, or ground and sky, with the shadows of some boxes painted on the floor."""
     room = world.room
     x, y, z = room.size_m
     density = min(_FINEST, _LARGEST / max(x, y, z))
@@ -209,7 +209,7 @@ def _shaded(picture: NDArray[np.uint8], light: NDArray[np.float32]) -> NDArray[n
 
 
 def _corner_dark(height: int, width: int, per_m: float, sides: float, top: float, bottom: float) -> NDArray[np.float32]:
-    """Return the light falloff near edges: reduced by these fractions towards the sides, the top and the bottom."""
+    """Return a surface's light, which falls by these fractions towards the sides, the top and the bottom."""
     x = (np.arange(width, dtype=np.float32) + 0.5) / per_m
     y = (np.arange(height, dtype=np.float32) + 0.5) / per_m
     across = 1.0 - sides * (np.exp(-x / 0.35) + np.exp(-x[::-1] / 0.35))

@@ -65,7 +65,7 @@ def turned(vectors: Floats, rotation: Floats) -> Floats:
 
 
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """Return those ``shown`` quads, (n,), that would each be visible on its own from a pose through a grid.
+    """Return the ``shown`` quads, (n,), that would be visible from a pose through a grid if nothing occluded them.
 
     :class:`DepthBuffer` handles occlusion.
     """
@@ -204,7 +204,7 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
     c = view.inverse_depth
     u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
     texture = quads.texture[k]
-    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0 (see ``Atlas``).
+    # a = (slope in optical axes) + (texel under the eye, less the span) c, because levels shift as ``Atlas`` explains.
     under_u = dot(u_slope, pose.position_m) + quads.u_start[k] - atlas.span[texture]
     under_v = dot(v_slope, pose.position_m) + quads.v_start[k]
     table = np.zeros((13, len(k) + 1))
@@ -279,7 +279,7 @@ class Shader:
         np.divide(1.0, w, out=inverse)
         # level = floor((floor(log2(footprint)) + 1) / 2), from the exponent bits, which also give scale = 2^-level
         np.take(table[9], seen, out=scale, mode="clip")
-        for _ in range(3):
+        for _ in range(3):  # the area that a pixel covers on a plane grows with the cube of its depth
             np.multiply(scale, inverse, out=scale)
         np.subtract(scale.view(np.int32), _ONE, out=levels)
         np.right_shift(levels, 24, out=levels)
@@ -310,10 +310,9 @@ class Shader:
         cv2.multiply(colours, light4, dst=colours, scale=1.0 / UNIT)
 
 
-# Maximum distance of a pixel from a shadow's plane at which the shadow darkens it, as a fraction of the pixel's depth.
-_THICKNESS = 4e-3
-_MORE_M = 4e-3
-_NEAR_M = 0.01
+# A pixel is darkened if its distance from the shadow's plane is below this fraction of its depth, plus this constant.
+_THICKNESS, _MORE_M = 4e-3, 4e-3
+_NEAR_M = 0.01  # corners of a shadow closer to the camera's plane than this are cut off
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,7 +335,7 @@ class Extremes:
 
     @staticmethod
     def along(values: NDArray[np.float32], axis: int) -> Extremes:
-        """Compute the extremes; axis 0 gives those of the columns."""
+        """Compute the extremes of the columns (axis 0) or of the rows (axis 1)."""
         least, most = values.min(axis=axis), values.max(axis=axis)
         return Extremes(least, most, float(least.min()), float(most.max()))
 

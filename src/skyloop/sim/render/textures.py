@@ -263,6 +263,7 @@ def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple
     course_number = np.floor(course).astype(np.intp)
     along = sheet.x_m / length_m + (course_number * shift).astype(np.float32)
     piece = np.floor(along).astype(np.intp)
+    # The number is unique as long as a course has fewer than 977 pieces.
     return piece + 977 * course_number, along - piece, np.broadcast_to(course - course_number, along.shape)
 
 

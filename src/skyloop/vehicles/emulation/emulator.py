@@ -27,7 +27,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.vehicles.emulation.video import VideoEncoding
 
-_LONGEST_WAIT_S: Final = 1.0
+_LONGEST_WAIT_S: Final = 1.0  # a socket, a timer or _wake() normally ends the loop's wait sooner
 _log = logging.getLogger(__name__)
 
 
@@ -109,7 +109,7 @@ class Loop:
             _log.exception("the emulated firmware raised an error and continues")
 
     def _wake(self) -> None:
-        with suppress(OSError):  # the pipe is full, so the loop is already awake
+        with suppress(OSError):  # the socket is full, so the loop is already being woken
             self._waker.send(b"\0")
 
     def _empty(self) -> None:
@@ -119,7 +119,7 @@ class Loop:
 
 Address = tuple[str, int]
 
-MAX_DATAGRAM: Final = 65_507
+MAX_DATAGRAM: Final = 65_507  #: largest payload of a UDP datagram over IPv4 [bytes]
 _MOST_AT_ONCE: Final = 64  # number of datagrams read before other callbacks run
 _SEND_BUFFER: Final = 1 << 20  # size in bytes; large enough for an AR.Drone 1's images
 
@@ -203,7 +203,7 @@ def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
     return made
 
 
-_BUFFER: Final = 1 << 16
+_BUFFER: Final = 1 << 16  # bytes per read
 
 
 class ByteServer:
@@ -319,7 +319,7 @@ class RunningEmulator(ABC):
         """Handle a crash; by default its effect appears only in the drone's own data. Runs on the loop's thread."""
 
     def _handle_report(self) -> None:
-        self._posted = False
+        self._posted = False  # first, so that a report that arrives from now on is posted again
         if self._report is not None:
             self._tick(self._report)
 
@@ -348,10 +348,7 @@ class RunningEmulator(ABC):
             self._video.show(model.name, pixels, captured_ns)
 
     def failed(self, error: Exception) -> None:
-        """Log an error in the simulation or the renderer.
-
-        Once reports stop, the firmware sends nothing, like a dead drone.
-        """
+        """Log an error in the simulation or the renderer. Without reports, the firmware then sends nothing."""
         _log.error("the simulation of drone %d failed: %r", self._drone, error)
 
 

@@ -181,7 +181,7 @@ class FlightControl:
     def lean_by_thrust(self, roll: float, pitch: float, thrust: float, yaw_rate: float) -> None:
         """Fly an attitude with a collective thrust, given as a multiple of the weight."""
         upward = GRAVITY_M_S2 * (thrust * math.cos(roll) * math.cos(pitch) - 1.0)
-        self._sinking += upward * self._step_s
+        self._sinking += upward * self._step_s  # stays within 1 m/s of the real climb rate, so that errors don't add up
         self._sinking = max(self.velocity[2] - 1.0, min(self.velocity[2] + 1.0, self._sinking))
         self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
 
@@ -195,8 +195,8 @@ class FlightControl:
 
     def _fly(self, action: AnyAction) -> None:
         if not action.finite:
-            action = Hover()  # numbers that are not finite are ignored
+            action = Hover()
         if self.vehicle.state is FlightState.LANDING:
-            self.lift_off()  # this makes the vehicle abort a landing
+            self.lift_off()  # aborts the landing
         if self.airborne:
             self.vehicle.command(action)

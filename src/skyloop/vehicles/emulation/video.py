@@ -51,7 +51,6 @@ class OneCamera:
 
     @property
     def inset(self) -> tuple[int, int]:
-        """Always (0, 0), because there is no inset."""
         return 0, 0
 
 

@@ -329,7 +329,7 @@ class ReplayPublisher:
 
 
 def described(applied: Applied) -> dict[str, Value]:
-    """Return a recorded command, both as requested and as applied, as native telemetry."""
+    """Return a recorded command as native telemetry, both as requested and as applied."""
     return {
         "replay.asked": applied.asked.name,
         "replay.asked.values": numbers(applied.asked),
@@ -344,10 +344,10 @@ def numbers(action: AnyAction) -> tuple[float, ...]:
     return tuple(math.nan if number is None else float(number) for number in given)
 
 
-HEARTBEAT_NS: Final = 50_000_000  #: time between repeats of the first state while waiting for a viewer
+HEARTBEAT_NS: Final = 50_000_000  #: interval at which the first state is repeated while waiting for a viewer
 PAUSE_NS: Final = 50_000_000  #: pause between two passes, on the replay's clock
-STILL_NS: Final = 200_000_000  #: time between repeats of the moment shown while paused
-IDLE_S: Final = 3600.0  #: time-out of a wait that normally ends only with a change
+STILL_NS: Final = 200_000_000  #: interval at which the moment shown is repeated while paused
+IDLE_S: Final = 3600.0  #: time-out of the wait at the end, which a written parameter ends
 LATE_NS: Final = 250_000_000  #: lag beyond which the schedule is postponed instead of rushed through
 
 
@@ -430,7 +430,7 @@ class Player:
         return self._source.first_ns + nanoseconds(self._playback.position_s)
 
     def _hold(self) -> None:
-        """Repeat the moment, so that late subscribers see it and the link does not appear to be lost."""
+        """Publish the same moment again, so that late subscribers see it and the link does not appear to be lost."""
         if self._sleep_until(self._clock() + STILL_NS) and self._still is not None:
             self._still()
 

@@ -189,7 +189,7 @@ class ReplaySource:
         return moment
 
 
-_NEVER_NS: Final = 1 << 63
+_NEVER_NS: Final = 1 << 63  # later than any time of a sample
 
 
 def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:

@@ -64,7 +64,7 @@ class SimDriver(Driver):
     See ``docs/autopilots.md``.
 
     Args:
-        uri: The vehicle's address. If a host is given, it determines everything except the options for firmware.
+        uri: The vehicle's address. If ``host`` is given, only the address's options for firmware count.
         host: A shared world; None to let :meth:`open` create one.
         drone: Number of the drone on the host.
     """
@@ -160,11 +160,11 @@ class SimDriver(Driver):
             self._firmware.driver.check(action)
 
     def left_to(self) -> str:
-        """Return the firmware's mode if another operator selected it; empty for the built-in autopilot."""
+        """Return the firmware's mode if another operator selected it, else an empty string."""
         return "" if self._firmware is None else self._firmware.driver.left_to()
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Apply an action requested by the failsafe, in the same way as the firmware's driver."""
+        """Apply an action requested by the failsafe, through the firmware's driver if firmware flies the drone."""
         return super().failsafe(action) if self._firmware is None else self._firmware.driver.failsafe(action)
 
     def external_pose(self, pose: ExternalPose) -> None:
@@ -175,7 +175,7 @@ class SimDriver(Driver):
             self._firmware.external_pose(pose)
 
     def checkup(self) -> list[Diagnostic]:
-        """Return the firmware's preflight findings."""
+        """Return the firmware's preflight findings; none for the built-in autopilot."""
         return [] if self._firmware is None else self._firmware.driver.checkup()
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
@@ -242,7 +242,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """Switch the simulated radio on or off. Like a real drone, it holds its position while it receives nothing."""
+        """Switch the simulated radio on or off. Without it, the built-in autopilot holds the drone's position."""
         sink = self._sink
         if sink is None:
             return
@@ -275,7 +275,7 @@ class SimDriver(Driver):
         sink.feedback(feedback_of(report, state, self.options))
 
     def happened(self, occurrence: Occurrence) -> None:
-        """Emit an event for a collision, an emergency or a low battery. Runs on one of the host's threads."""
+        """Emit an event for an occurrence. Runs on one of the host's threads."""
         sink = self._sink
         if sink is None or not self._link:
             return

@@ -34,7 +34,7 @@ from skyloop.vehicles.sim.firmware.program import CoupledFirmware, FirmwareEvent
 from skyloop.vehicles.sim.telemetry import native_of as truth_of
 from skyloop.vehicles.sim.telemetry import truth_at
 
-#: Addresses for drivers that are never opened. Any will do, because capabilities do not depend on the address.
+#: Addresses for drivers that are never opened. Any address works, because capabilities don't depend on it.
 _SOMEWHERE: Final = {
     **dict.fromkeys((AutopilotKind.ARDUPILOT, AutopilotKind.PX4), "mavlink://udpin:127.0.0.1:14550"),
     AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
@@ -204,7 +204,7 @@ class FirmwareFlight:
                 )
 
     def with_truth(self, feedback: Feedback) -> Feedback:
-        """Return the firmware's feedback, with the true state at the same time if that is known already."""
+        """Return the firmware's feedback with the true state at its time, or unchanged if no report has arrived."""
         reports = tuple(self._reports)
         if not reports:
             return feedback

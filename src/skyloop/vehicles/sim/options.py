@@ -33,7 +33,7 @@ TRUTH_HZ: Final = 100.0  #: rate at which the ground truth is stored alongside t
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
-    """Parse an address."""
+    """Parse an address; raise UsageError if an option is unknown, invalid or does not fit the others."""
     if "process" in uri.options:
         raise UsageError(f"{uri}: process=none is an option of skyloop.connect(), which removes it: leave it out here")
     autopilot = _autopilot(uri)

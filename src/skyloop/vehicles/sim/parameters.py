@@ -20,14 +20,14 @@ _LIMITS: Final = (
     ("limits.tilt", "tilt_rad", "rad", "greatest roll and pitch"),
     ("limits.climb", "climb_m_s", "m/s", "greatest climb and descent"),
     ("limits.yaw_rate", "yaw_rate_rad_s", "rad/s", "greatest yaw rate"),
-    ("limits.altitude", "altitude_m", "m", "ceiling above the floor"),
+    ("limits.altitude", "altitude_m", "m", "maximum height above the floor"),
     ("limits.speed", "speed_m_s", "m/s", "greatest horizontal speed of a velocity set-point"),
-    ("limits.takeoff_altitude", "takeoff_altitude_m", "m", "where a take-off ends"),
+    ("limits.takeoff_altitude", "takeoff_altitude_m", "m", "height at which a take-off ends"),
 )
 #: For each camera parameter: last part of the name, field in :class:`CameraModel`, unit, range and description.
 _CAMERA: Final = (
-    ("fps", "fps", "1/s", (0.1, 240.0), "pictures a second of simulated time"),
-    ("latency", "latency_s", "s", (0.0, 5.0), "from exposure to delivery"),
+    ("fps", "fps", "1/s", (0.1, 240.0), "frames per second of simulated time"),
+    ("latency", "latency_s", "s", (0.0, 5.0), "time from exposure to delivery"),
     ("noise", "noise_sigma", "", (0.0, 100.0), "standard deviation of each pixel, in steps of 0 to 255"),
     ("gain", "exposure_gain", "", (0.05, 20.0), "brightness, relative to the scene's own"),
 )

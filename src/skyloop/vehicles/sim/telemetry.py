@@ -1,4 +1,4 @@
-"""Converts the simulator's reports about a drone to feedback. Pure."""
+"""Conversion of the simulator's reports on a drone to feedback. Pure."""
 
 from __future__ import annotations
 

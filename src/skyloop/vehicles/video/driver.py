@@ -39,7 +39,7 @@ from skyloop.vehicles.video.player import (
 )
 from skyloop.vehicles.video.v4l2 import FORMATS, V4l2Device, cameras, described, opened
 
-_CLOSE_S = 2.0
+_CLOSE_S = 2.0  # time allowed for the thread to end
 
 
 class VideoDriver(Driver):

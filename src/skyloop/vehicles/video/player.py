@@ -50,7 +50,7 @@ class DecodedImage:
 
 
 def is_device(path: Path) -> bool:
-    """Return whether the path is that of a device, present or not, rather than a file."""
+    """Return whether a path names a device, present or not, rather than a file."""
     if path.is_relative_to("/dev"):
         return True
     try:
@@ -79,7 +79,7 @@ class ContainerSource:
     def __init__(self, name: str) -> None:
         self._name = name
         self.damaged = 0  #: number of pieces so far that could not be decoded
-        self.stream = ""  #: ``h264`` if images in this codec can be relayed unchanged, otherwise empty
+        self.stream = ""  #: ``h264`` if images in this codec can be relayed unchanged, else empty
         try:
             self._container: InputContainer = av.open(name)
         except (FFmpegError, OSError, ValueError) as error:
@@ -169,7 +169,7 @@ class PaveSource:
         self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
     def images(self) -> Iterator[DecodedImage]:
-        """See :meth:`Source.images`. Every image is decoded, because each depends on the previous one."""
+        """Yield the images. All are decoded, because each depends on the previous one."""
         decoder = PaveDecoder()
         for frame in self._parser_frames():
             image = decoder.decode(frame)
@@ -211,7 +211,7 @@ class FilePacer:
         self._due_ns = 0
 
     def due_ns(self, stamp_s: float, now_ns: int) -> int:
-        """Return the time to show the image with this stamp, given that it was ready at ``now_ns``."""
+        """Return the time at which to show the image with this stamp, given that it was ready at ``now_ns``."""
         if self._stamp_s is None:
             self._due_ns = now_ns
         else:

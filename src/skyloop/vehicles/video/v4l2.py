@@ -22,8 +22,8 @@ Ioctl = Callable[[int, int, bytearray], object]
 
 _READ, _WRITE = 2, 1  # _IOC_READ, _IOC_WRITE
 _CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE, and V4L2_CAP_VIDEO_CAPTURE
-_DEVICE_CAPS: Final = 1 << 31
-_DISCRETE: Final = 1
+_DEVICE_CAPS: Final = 1 << 31  # V4L2_CAP_DEVICE_CAPS
+_DISCRETE: Final = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
 _MOST: Final = 256  # maximum number of formats, sizes and rates, in case a device's list never ends
 
 CAPABILITY: Final = struct.Struct("=16s32s32sIII12x")
@@ -47,13 +47,11 @@ QUERYCTRL: Final = _request(_READ | _WRITE, 36, QUERY)
 ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, SIZE)
 ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, INTERVAL)
 
-AUTO_GAIN: Final = 0x00980912
-GAIN: Final = 0x00980913
-AUTO_EXPOSURE: Final = 0x009A0901
-EXPOSURE: Final = 0x009A0902  #: exposure time in units of 100 µs
+# V4L2_CID_AUTOGAIN, V4L2_CID_GAIN, V4L2_CID_EXPOSURE_AUTO, and V4L2_CID_EXPOSURE_ABSOLUTE, in units of 100 µs.
+AUTO_GAIN, GAIN, AUTO_EXPOSURE, EXPOSURE = 0x00980912, 0x00980913, 0x009A0901, 0x009A0902
 _AUTO, _MANUAL, _APERTURE_FIRST = 0, 1, 3  # values of AUTO_EXPOSURE; UVC cameras use the last one for "auto"
-_EXPOSURE_MS: Final = 0.1
-_DISABLED: Final = 1
+_EXPOSURE_MS: Final = 0.1  # unit of EXPOSURE
+_DISABLED: Final = 1  # V4L2_CTRL_FLAG_DISABLED
 
 #: FFmpeg's format names by our own.
 FORMATS: Final = {"mjpeg": "mjpeg", "yuyv": "yuyv422", "h264": "h264", "nv12": "nv12", "grey": "gray"}
@@ -246,6 +244,7 @@ def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
 
 
 def _fourcc(code: int) -> str:
+    # Bit 31 marks a big-endian variant and is not part of the four characters.
     return (code & 0x7FFFFFFF).to_bytes(4, "little").decode("latin-1").strip()
 
 
@@ -327,8 +326,7 @@ def listed(camera: CameraDevice, ioctl: Ioctl | None = None) -> list[str]:
         return [str(camera)]
     try:
         with opened(str(camera.path), ioctl) as device:
-            told = [*map(str, device.formats()), *device.settings()]
-            lines = told if device.captures() else ["captures no images"]
+            lines = [*map(str, device.formats()), *device.settings()] if device.captures() else ["captures no images"]
     except OSError as error:
         lines = [f"can't be opened: {error.strerror or error}"]
     return [str(camera), *(f"  {line}" for line in lines)]

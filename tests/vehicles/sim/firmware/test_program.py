@@ -18,7 +18,7 @@ from skyloop.vehicles.sim.firmware.program import (
     FirmwareEventKind,
     Launch,
     Program,
-    StartedInVainError,
+    UnresponsiveError,
     find_program,
 )
 
@@ -117,7 +117,7 @@ def test_an_exit_code_is_no_signal_unless_there_is_one_of_its_number(code: int) 
 
 def test_one_that_does_not_answer_is_restarted_at_once_but_not_forever() -> None:
     def verify() -> None:
-        raise StartedInVainError("it does not listen")
+        raise UnresponsiveError("it does not listen")
 
     with Watched(SLEEPS, verify=verify) as watched:
         for _ in range(AT_ONCE + 2):

@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import pytest
 
 from skyloop.vehicles.sim.firmware.betaflight import Betaflight
-from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, become_prompt
+from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, request_real_time
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
 
 
 def test_without_permissions_it_uses_what_needs_none(asked: list[tuple[object, ...]]) -> None:
-    become_prompt()
+    request_real_time()
     assert asked[0][1] == SLACK_NS
     assert asked[1][1] == os.SCHED_RR
     assert asked[2] == (os.PRIO_PROCESS, 0, NICENESS)
@@ -42,13 +42,13 @@ def test_with_permissions_it_runs_ahead_of_all_ordinary_processes(
     asked: list[tuple[object, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_setscheduler", lambda *what: asked.append(what))
-    become_prompt()
+    request_real_time()
     assert len(asked) == 2
 
 
 def test_elsewhere_nothing_happens(asked: list[tuple[object, ...]], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "darwin")
-    become_prompt()
+    request_real_time()
     assert asked == []
 
 

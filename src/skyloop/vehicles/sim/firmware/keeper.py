@@ -1,9 +1,9 @@
 """Run flight firmware as the only child process, and end it when the parent of this process ends.
 
-``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--prompt] [--apart=…] NAME=VALUE … -- COMMAND …`` writes
-the firmware's process id to standard output and appends the firmware's output to LOG. ``--prompt`` gives the firmware
-priority; ``--apart`` gives it a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code is the
-firmware's or, as in a shell, 128 plus the number of the signal that ended it.
+``python -m skyloop.vehicles.sim.firmware.keeper FOLDER LOG [--real-time] [--network=…] NAME=VALUE … -- COMMAND …``
+writes the firmware's process id to standard output and appends the firmware's output to LOG. ``--real-time`` gives the
+firmware priority; ``--network`` gives it a separate network (:mod:`skyloop.vehicles.sim.firmware.ports`). The exit code
+is the firmware's or, as in a shell, 128 plus the number of the signal that ended it.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from skyloop.child_process import on_parent_end
 from skyloop.vehicles.sim.firmware import ports
 
 LOW_PRIORITY: Final = 1  #: priority in the real-time scheduler, which runs ahead of all ordinary processes
-NICENESS: Final = -10  #: niceness if real-time scheduling is not allowed
-SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; 50 µs by default
+NICENESS: Final = -10  #: niceness without real-time scheduling, and change of it by :func:`raise_priority`
+SLACK_NS: Final = 1  #: how long the kernel may delay wake-ups; its default is 50 µs
 _PR_SET_TIMERSLACK: Final = 29  # linux/prctl.h
 TERMINATE_S: Final = 2.0  #: time allowed for the firmware to exit on request
-PROMPT: Final = "--prompt"
+REAL_TIME: Final = "--real-time"
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 
 _priority_lock: Final = threading.Lock()  # guards the two variables below, which are process-wide like the niceness
@@ -34,11 +34,8 @@ _prioritizers = 0  # number of raise_priority() calls that have not been undone
 _niceness: Final[dict[int, int]] = {}  # original niceness of each thread whose niceness was changed
 
 
-def become_prompt() -> None:
-    """Make the kernel wake up this process and its children on time, which is reliable only as root. Never raises.
-
-    This has an effect only on Linux.
-    """
+def request_real_time() -> None:
+    """Have the kernel wake up this process and its children on time. Works only on Linux, reliably only as root."""
     if sys.platform != "linux":
         return
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, SLACK_NS)
@@ -90,9 +87,9 @@ def main(arguments: list[str]) -> int:
         raise NotImplementedError
     cut = arguments.index("--")
     folder, log, *settings = arguments[:cut]
-    prompt = PROMPT in settings
-    if prompt:
-        settings.remove(PROMPT)
+    real_time = REAL_TIME in settings
+    if real_time:
+        settings.remove(REAL_TIME)
     relays = [ports.Relay(setting) for setting in settings if setting.startswith(ports.OPTION)]
     settings = [setting for setting in settings if not setting.startswith(ports.OPTION)]
     environment = {**os.environ, **dict(setting.split("=", 1) for setting in settings)}
@@ -101,8 +98,8 @@ def main(arguments: list[str]) -> int:
     def begin() -> None:
         if libc is not None:  # if this process is killed, it can't end the firmware
             libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if prompt:
-            become_prompt()
+        if real_time:
+            request_real_time()
 
     with Path(log).open("ab") as output:
         firmware = subprocess.Popen(

@@ -31,7 +31,7 @@ _reserved: set[tuple[str, int]] = set()  # instances started by this process tha
 
 
 def bound(kind: socket.SocketKind, port: int = 0) -> socket.socket:
-    """Return a socket bound to a loopback port; 0 for any free one."""
+    """Return a socket bound to a loopback port; port 0 means any free one."""
     made = socket.socket(socket.AF_INET, kind)
     try:
         if kind is socket.SOCK_STREAM:
@@ -80,7 +80,7 @@ def reserve_instance(
             if all(is_free(kind, port) for kind, port in ports(instance)) and not runs(instance):
                 _reserved.add((firmware, instance))
                 return instance
-    raise UsageError(f"no ports are free for another {firmware}: {most} at most fly on one computer; end one of them")
+    raise UsageError(f"no ports are free for another {firmware}: {most} at most can fly on one computer")
 
 
 def release_instance(firmware: str, instance: int) -> None:
@@ -89,15 +89,15 @@ def release_instance(firmware: str, instance: int) -> None:
         _reserved.discard((firmware, instance))
 
 
-OPTION: Final = "--apart="
-CONNECT_S: Final = 1.0
-MAX_READ: Final = 65536
+OPTION: Final = "--network="
+CONNECT_S: Final = 1.0  #: time-out for a connection to the firmware, which is on the same computer
+MAX_READ: Final = 65536  #: bytes per read
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
 _SIOCSIFFLAGS: Final = 0x8914  # linux/sockios.h
 _UP_AND_RUNNING: Final = 0x41  # linux/if.h
 
 
-class Apart:
+class SeparateNetwork:
     """The parent's side of the connection to firmware in a separate network.
 
     ``port`` is the TCP port on this computer that is forwarded to the firmware's TCP port.
@@ -122,7 +122,7 @@ class Apart:
         return OPTION + ",".join(map(str, (*self.descriptors, *self._ports)))
 
     def receive_socket(self) -> socket.socket:
-        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError without a new socket."""
+        """Return the newest keeper's UDP socket; the caller must close it. Raises OSError if there is no new one."""
         if sys.platform == "win32":
             raise NotImplementedError
         newest = None
@@ -190,7 +190,7 @@ def _carry(source: socket.socket, sink: socket.socket) -> None:
 def leave_network() -> None:
     """Move this process into a new network that has only a loopback interface.
 
-    This requires root, or a kernel that allows unprivileged user namespaces; otherwise it raises OSError.
+    Raises OSError unless this process is root or the kernel allows unprivileged user namespaces.
     """
     if sys.platform != "linux":
         raise OSError("separate networks exist only on Linux")

@@ -20,16 +20,15 @@ from typing import ClassVar, Final
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.sim.instruments import Readings
-from skyloop.vehicles.sim.firmware.keeper import PROMPT
-from skyloop.vehicles.sim.firmware.ports import Apart
+from skyloop.vehicles.sim.firmware.keeper import REAL_TIME
+from skyloop.vehicles.sim.firmware.ports import SeparateNetwork
 
 RESTART_S: Final = 1.0  #: time from the firmware's exit to its next start, doubled after each early exit
-LONGEST_RESTART_S: Final = 30.0
+LONGEST_RESTART_S: Final = 30.0  #: limit of RESTART_S
 SOON_S: Final = 10.0  #: run time below which an exit counts as early
 AT_ONCE: Final = 5  #: number of consecutive failed starts that are retried without a pause
 LOG: Final = "firmware.log"
-_LAST_LINES: Final = 5
-_LAST_BYTES: Final = 2000
+_LAST_LINES, _LAST_BYTES = 5, 2000  # maximum length of the output quoted when the firmware ends
 
 
 class FirmwareEventKind(StrEnum):
@@ -43,7 +42,7 @@ class FirmwareEventKind(StrEnum):
     DEAF = "deaf"  #: the process ran but did not reply; another process is started at once
 
 
-class StartedInVainError(OSError):
+class UnresponsiveError(OSError):
     """Raised if the process is running but will never reply, so that it must be restarted at once."""
 
 
@@ -61,12 +60,12 @@ class Launch:
 
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)  #: variables in addition to this process's environment
-    prompt: bool = False  #: whether the firmware needs prompt wake-ups; see ``become_prompt`` in ``keeper.py``
-    apart: Apart | None = None  #: the separate network to run in; None for the computer's network
+    real_time: bool = False  #: whether it must be woken up on time; see ``request_real_time`` in ``keeper.py``
+    network: SeparateNetwork | None = None  #: the network to run in; None for the computer's own
 
     def keep(self, folder: Path, log: str = LOG) -> ChildProcess:
         """Start the firmware in a folder, under a keeper."""
-        descriptors = () if self.apart is None else self.apart.descriptors
+        descriptors = () if self.network is None else self.network.descriptors
         return ChildProcess(keeper_command(self, folder, log), inherited=descriptors)
 
 
@@ -92,7 +91,7 @@ class Program:
         there; it raises :class:`~skyloop.errors.SkyloopError` or ``OSError`` if the firmware can't be started now.
         ``report`` is called with each event, on one of this object's threads. ``verify`` is called once the process is
         running, before the start is reported; it raises ``OSError`` to have the process ended and restarted, or
-        :class:`StartedInVainError` to do that at once. Without a ``folder``, a new one is used and later removed.
+        :class:`UnresponsiveError` to do that at once. Without a ``folder``, a new one is used and later removed.
         """
         self.name = name
         self.starts = 0
@@ -136,22 +135,22 @@ class Program:
 
     def _watch(self, folder: Path) -> None:
         pause_s = self._restart_s
-        in_vain = 0
+        unresponsive = 0
         while not self._ending.is_set():
             begun_s = time.monotonic()
             try:
                 ended = self._run_once(folder)
-            except StartedInVainError as error:
+            except UnresponsiveError as error:
                 self._report(FirmwareEvent(FirmwareEventKind.DEAF, f"{self.name} is started again: {error}"))
-                in_vain += 1
-                if in_vain <= AT_ONCE:
+                unresponsive += 1
+                if unresponsive <= AT_ONCE:
                     continue
             except (SkyloopError, OSError) as error:
                 self._report(FirmwareEvent(FirmwareEventKind.FAILED, f"{self.name} can't be started: {error}"))
             else:
-                in_vain = 0
+                unresponsive = 0
                 if not self._ending.is_set():
-                    self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_stderr_tail(folder)}"))
+                    self._report(FirmwareEvent(FirmwareEventKind.DIED, f"{self.name} {ended}{_output_tail(folder)}"))
             soon = time.monotonic() - begun_s < SOON_S
             self._ending.wait(pause_s)
             pause_s = min(2 * pause_s, LONGEST_RESTART_S) if soon else self._restart_s
@@ -173,7 +172,7 @@ class Program:
             try:
                 if self._verify is not None:
                     self._verify()
-            except StartedInVainError:
+            except UnresponsiveError:
                 if child.code is None:
                     raise  # otherwise the process died, which is reported with its output
             self._report(FirmwareEvent(FirmwareEventKind.STARTED, f"{self.name} runs as process {self.pid}"))
@@ -188,8 +187,8 @@ class Program:
 
 def keeper_command(launch: Launch, folder: Path, log: str = LOG) -> list[str]:
     """Return the command that runs a firmware in a folder, for a :class:`~skyloop.child_process.ChildProcess`."""
-    settings = [PROMPT] if launch.prompt else []
-    settings += [launch.apart.option] if launch.apart is not None else []
+    settings = [REAL_TIME] if launch.real_time else []
+    settings += [launch.network.option] if launch.network is not None else []
     settings += [f"{name}={value}" for name, value in launch.environment.items()]
     keeper = [sys.executable, "-m", "skyloop.vehicles.sim.firmware.keeper", str(folder), str(folder / log)]
     return [*keeper, *settings, "--", *launch.command]
@@ -201,22 +200,22 @@ def find_program(variable: str, names: Sequence[str], what: str, where: str) -> 
     if given:
         path = Path(given).expanduser()
         if not (path.is_file() and os.access(path, os.X_OK)):
-            raise UsageError(f"{variable} is {given!r}, which is not a program: it must be the path of {what}'s")
+            raise UsageError(f"{variable} is {given!r}, which is not a program: give the path of {what}'s program")
         return str(path.resolve())
     for name in names:
         found = shutil.which(name)
         if found is not None:
             return found
-    raise UsageError(f"{what}'s program is not here: set {variable} to its path. {where}")
+    raise UsageError(f"{what}'s program was not found: set {variable} to its path. {where}")
 
 
 def _ending(code: int | None) -> str:
-    with suppress(ValueError, TypeError):  # like -1, 255 is the program's own exit code
+    with suppress(ValueError, TypeError):  # an exit code such as 255 stands for no signal
         return f"was killed by {signal.Signals((code or 0) - 128).name}"
     return f"ended with exit code {code}"
 
 
-def _stderr_tail(folder: Path) -> str:
+def _output_tail(folder: Path) -> str:
     try:
         with (folder / LOG).open("rb") as log:
             log.seek(max(0, log.seek(0, os.SEEK_END) - _LAST_BYTES))
@@ -229,7 +228,7 @@ def _stderr_tail(folder: Path) -> str:
 
 # Coupled to a simulation ---------------------------------------------------------------------------------------------
 
-WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, there is no waiting until the firmware replies
+WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, steps don't wait until the firmware has replied
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
 SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
@@ -327,7 +326,7 @@ class CoupledFirmware(ABC):
         """Write the firmware's startup files and return how to start it. Runs on the program's thread."""
 
     def _verify(self) -> None:  # noqa: B027  most firmware either starts properly or exits
-        """Return once its process has started properly, on the program's thread; raise OSError to repeat the start."""
+        """Return once the process has started properly, or raise OSError to have it started again."""
 
     @abstractmethod
     def _begin(self) -> None:

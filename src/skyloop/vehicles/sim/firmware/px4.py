@@ -32,20 +32,19 @@ WHERE: Final = (
     "How to get it: https://docs.px4.io/main/en/dev_setup/building_px4.html (px4_sitl); it is bin/px4 of the build"
 )
 MODEL: Final = "none_iris"  #: PX4's quadrotor for an external simulator
-AIRFRAME: Final = "10016"
-SIMULATOR_PORT = 4560  # base port, to which the instance number is added
-TELEMETRY_PORT = 14540
-COMPANION_PORT = 14580
-STATION_PORT = 18570
+AIRFRAME: Final = "10016"  #: its number
+# Ports in PX4's startup scripts, to which the instance number is added: of the simulator and the receiver of telemetry,
+# then PX4's own for a companion computer and a ground station.
+SIMULATOR_PORT, TELEMETRY_PORT, COMPANION_PORT, STATION_PORT = 4560, 14540, 14580, 18570
 MOST_INSTANCES: Final = 10  #: maximum number of instances: PX4 would use the same port for all further vehicles
 STEPS: Final = 4  #: simulation steps per step of PX4: 250 Hz, as its startup script for such simulators expects
-STEP_US: Final = 4000
+STEP_US: Final = 4000  #: duration of a step of PX4
 TRUTH_EVERY: Final = 5  #: number of PX4 steps between truth messages
-RANGE_EVERY: Final = 10
+RANGE_EVERY: Final = 10  #: number of PX4 steps between readings of the range finder
 PROBE_EVERY: Final = 25  #: number of PX4 steps between probes while PX4 is silent
-LOCK_FILE = "/tmp/px4_lock"
+LOCK_FILE = "/tmp/px4_lock"  # followed by a hyphen and the instance number
 MAX_BACKLOG: Final = 4096  #: number of unsent bytes at which PX4 is assumed to have stopped reading
-MAX_READ: Final = 65536
+MAX_READ: Final = 65536  #: bytes per read
 #: Parameters for this vehicle. Without a remote control, PX4 must hold position when set-points stop.
 PARAMETERS: Final = {
     "MPC_THR_HOVER": "0.7",
@@ -58,14 +57,14 @@ PARAMETERS: Final = {
 GPS_DELAYS: Final = ("EKF2_GPS_DELAY", "SENS_GPS0_DELAY")
 _EVERYTHING: Final = 0b1_1011_1111_1111  #: flags marking all readings except the differential pressure as new
 _NO_LOGS: Final = {"SDLOG_MODE": "-1"}
-_SYSTEM, _COMPONENT = 1, 200
+_SYSTEM, _COMPONENT = 1, 200  # the simulator's ids; MAV_COMP_ID_IMU
 _DOWN: Final = 25  # MAV_SENSOR_ROTATION_PITCH_270
-_FIX_3D: Final = 3
-_UNKNOWN_COURSE: Final = 65535
+_FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX
+_UNKNOWN_COURSE: Final = 65535  # HIL_GPS.cog
 
 
 class Px4(CoupledFirmware):
-    """PX4 flying a simulated drone. See :class:`CoupledFirmware`."""
+    """PX4 flying a simulated drone."""
 
     NAME: ClassVar[str] = "PX4"
 
