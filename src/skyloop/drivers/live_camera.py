@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 STALLED_S: Final = 1.5  #: time without data, or three frame periods if longer, after which a stream is reopened
 _WHERE: Final = "camera"  # source of the camera's events
 OPEN_S: Final = 5.0  #: time limit for the connection, the handshake and the first frame
-V4L2: Final = "v4l2"
+DEVICE_FORMAT: Final = "v4l2"
 #: FFmpeg's input formats for cameras of macOS and Windows, and how each names a camera without a microphone
 #: (ffmpeg.org/ffmpeg-devices.html). They are written like schemes: ``dshow://Integrated Camera``, ``avfoundation://0``.
 OTHER_DEVICES: Final = {"avfoundation": "{}:none", "dshow": "video={}"}
@@ -64,7 +64,7 @@ class CameraSource:
     sdp: str = ""  #: session description (RFC 4566), if no server provides it
     fallback: Mapping[str, str] | None = None  #: options for a retry if the server refuses the first protocol
     loses: bool = False  #: whether parts of frames can be lost unnoticed
-    device: str = V4L2  #: FFmpeg's input format for a device
+    device: str = ""  #: FFmpeg's input format for a device of another system than Linux
 
     @property
     def host(self) -> str | None:
@@ -286,12 +286,12 @@ class LiveCamera:
     def _open_device(self, open_stream: Callable[..., ContainerStream]) -> ContainerStream:
         settings = self._settings
         path, device = settings.source.name, settings.source.device
-        if device == V4L2 and not Path(path).exists():
+        if not device and not Path(path).exists():
             raise FileNotFoundError(self._absent())
         size = f"{settings.width}x{settings.height}"
         options = {"video_size": size, "framerate": f"{settings.fps:g}", **settings.device_options}
-        stream = open_stream(path, format_name=device, options=options)
-        for problem in self._configure(path) if self._configure is not None and device == V4L2 else []:
+        stream = open_stream(path, format_name=device or DEVICE_FORMAT, options=options)
+        for problem in self._configure(path) if self._configure is not None and not device else []:
             if problem not in self._reported:
                 self._reported.append(problem)
                 self._report(problem)
