@@ -38,10 +38,7 @@ class ArdroneDriver(Driver):
         self._camera = "front"
 
     def capabilities(self) -> Capabilities:
-        """Return the drone's capabilities.
-
-        The cameras are those of an AR.Drone 2 unless the address specifies version 1.
-        """
+        """Return the capabilities, with the cameras of an AR.Drone 2 unless the address specifies version 1."""
         version = self.options.version
         return Capabilities(
             vehicle=f"ardrone{version}" if version else "ardrone",
@@ -162,7 +159,7 @@ class ArdroneDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the active camera's intrinsics; intrinsics in the address apply to the front camera."""
+        """Return the front camera's intrinsics if the address has any; None for the bottom camera."""
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:

@@ -26,8 +26,7 @@ class CommandSequence:
     """Accepts a command only if its number is greater than the last accepted one, or is 1, which restarts the count.
 
     After two seconds without an accepted command, any number greater than 0 is accepted. The Developer Guide says that
-    clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost,
-    so the emulated drone does not insist on it.
+    clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost.
     """
 
     def __init__(self) -> None:
@@ -62,6 +61,7 @@ _CAMERAS: Final = {
     VideoChannel.FRONT_WITH_BOTTOM: ("front", "bottom"),
     VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
 }
+#: Size of the second camera's image within the first one's [px].
 _INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
 #: Legacy and factory commands, which a real drone accepts and which have no effect here.
 _WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
@@ -147,7 +147,7 @@ class ArdroneLogic:
             self._execute(command, ids)
 
     def supervise(self, believed: VehicleFeedback) -> None:
-        """Run the watchdogs and check the battery and angles. Called regularly with the vehicle's own estimate."""
+        """Run the watchdogs and check battery and angles, given the vehicle's own estimate. Called on every report."""
         silence_s = self.silence_s
         if silence_s > WATCHDOG_S:
             self._watchdog = True
