@@ -75,17 +75,13 @@ def set_point(
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
         # The command is relative to the remote control's heading: rotate it by the difference to the drone's heading.
-        right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
+        right, ahead = turned(right, ahead, (math.pi / 2 - yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
     if progress.flags & Pcmd.COMBINED_YAW and int(configuration.number("control:control_level")) & _COMBINED_YAW_LEVEL:
         yaw_rate -= GRAVITY_M_S2 * math.tan(roll) / max(forward_m_s, _LEAST_TURNING_SPEED_M_S)
     climb = clamped(progress.gaz, 1.0) * configuration.number("control:control_vz_max") / 1000
     return Attitude(roll, pitch, climb, yaw_rate)
-
-
-def _clockwise_from_north(yaw_rad: float) -> float:
-    return math.pi / 2 - yaw_rad
 
 
 def _possible(name: str, value: float) -> float:
@@ -99,14 +95,6 @@ BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no
 CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn in about 4 s; an estimate
 
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
-
-
-@dataclass(frozen=True, slots=True)
-class Animation:
-    """A requested flight animation, which is stored but not flown."""
-
-    number: int
-    until_ns: int
 
 
 class FlightControl:
@@ -124,7 +112,7 @@ class FlightControl:
         self.battery_low = False
         self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM, subtracted in navdata
         self.progress = NO_PROGRESS  #: the last valid PCMD or PCMD_MAG
-        self.animation: Animation | None = None
+        self.animation: tuple[int, int] | None = None  #: number and end [ns] of the animation last requested
         self.calibrations = 0  #: number of magnetometer calibrations started so far
 
     # Commands --------------------------------------------------------------------------------------------------
@@ -179,7 +167,7 @@ class FlightControl:
     def animate(self, number: int, duration_ms: int, now_ns: int) -> None:
         """Handle ``ANIM``, or a write to the key ``control:flight_anim``. Ignored unless flying."""
         if 0 <= number < len(FLIGHT_ANIMATIONS) and 0 <= duration_ms <= 60_000 and self._vehicle.state in _FLYING:
-            self.animation = Animation(number, now_ns + duration_ms * 1_000_000)
+            self.animation = number, now_ns + duration_ms * 1_000_000
 
     def calibrating(self, now_ns: int) -> bool:
         """Return whether the drone is turning to calibrate its magnetometer."""
@@ -187,7 +175,7 @@ class FlightControl:
 
     def flipping(self, now_ns: int) -> bool:
         """Return whether a requested flip is still in progress."""
-        return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
+        return self.animation is not None and self.animation[0] >= FIRST_FLIP and now_ns < self.animation[1]
 
     # Supervision -----------------------------------------------------------------------------------------------
 

@@ -62,7 +62,7 @@ from skyloop.errors import DecodeError
 
 # Constants and tables, for the emulator's encoder as well ------------------------------------------------------------
 
-START_CODE_BITS: Final = 22
+START_CODE_BITS: Final = 22  #: width of a start code
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; add k for group k
 P264_START: Final = 0x40  #: start code of the drone's other codec
 END_OF_PICTURE: Final = 0x3F  #: code that marks the end where group 31 would start
