@@ -112,7 +112,7 @@ def measure(
     Args:
         seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
         mavlink: Number of emulated MAVLink vehicles in another case; 0: none.
     """
     machine, results = Machine.here(), []

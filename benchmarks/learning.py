@@ -56,7 +56,7 @@ def measure(seconds: float, cases: tuple[Case, ...] = CASES, progress: Progress 
     Args:
         seconds: Approximate total duration [s].
         cases: The environments.
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     machine = Machine.here()
     COMPILER.start().join()

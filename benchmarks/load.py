@@ -170,7 +170,7 @@ def measure(
         cases: The cases.
         record_to: The folder for the recorder.
         skipped: Cases omitted by the caller, with reasons, for the result.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
@@ -358,7 +358,7 @@ def load(path: Path) -> Load:
     """Read ``load.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Load, "the results of benchmarks.load", MAX_RESULTS)
 

@@ -98,7 +98,7 @@ def measure(
         seconds: Duration of each case [s].
         losses: Shares of packets lost.
         ways: The ways to connect, by name.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
         UnsupportedError: No hosts can be created here.
@@ -239,8 +239,8 @@ def describe(path: Impairments) -> str:
 def load(path: File) -> Network:
     """Read ``network.json``.
 
-    FileFormatError: It is not such a file.
-        FileFormatError: It is anything else.
+    Raises:
+        FileFormatError: The file has another format.
     """
     return read_json(path, Network, "the results of benchmarks.network", MAX_RESULTS)
 

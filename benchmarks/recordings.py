@@ -87,7 +87,7 @@ def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda 
     Args:
         seconds: Duration of the recorded flight [s].
         encode: Whether to also measure the export that decodes and encodes each picture.
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     machine = Machine.here()
     with tempfile.TemporaryDirectory() as folder:

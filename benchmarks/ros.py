@@ -61,7 +61,7 @@ def measure(
     Args:
         seconds: The duration [s].
         ros_python: An interpreter with rclpy and Skyloop; None: that of ``SKYLOOP_ROS_PYTHON``, or this one.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
         NoAnswerError: A process did not start, or failed.

@@ -152,7 +152,7 @@ def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _
     Args:
         seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     skipped: dict[str, str] = {}
@@ -360,7 +360,7 @@ def load(path: Path) -> Scale:
     """Read ``scale.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Scale, "the results of benchmarks.scale", MAX_RESULTS)
 

@@ -105,7 +105,7 @@ def measure(
         drones: Number of drones.
         users: Number of processes that fly them.
         observers: Number of processes that watch all of them.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     with _stage(drones, users, observers) as stage:
@@ -238,7 +238,7 @@ def load(path: Path) -> Swarm:
     """Read ``swarm.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Swarm, "the results of benchmarks.swarm", MAX_RESULTS)
 
