@@ -1,4 +1,4 @@
-"""Child processes: they end when they are told to, at once or after signals, and with their parent."""
+"""Child processes end on request, at once or after signals, and with their parent."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_the_end_of_the_parents_pipe_is_heard() -> None:
 
 
 def test_a_fork_leaves_the_child_of_its_parent_alone() -> None:
-    """What a fork of this process does to its copy of the object; the process itself goes on."""
+    """A fork of this process ends its copy of the object; the child process continues."""
     code = "import sys; print('x', flush=True); sys.stdin.read(); print('y', flush=True)"
     child = ChildProcess([sys.executable, "-c", code])
     assert child.stdout.readline() == b"x\n"

@@ -1,4 +1,4 @@
-"""What holds the repository together: floors of coverage, budgets of rooms and paths, and the locked versions."""
+"""Checks of the repository: coverage floors, budgets of rooms and paths, and locked versions."""
 
 from __future__ import annotations
 

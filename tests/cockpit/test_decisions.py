@@ -126,7 +126,7 @@ def test_a_page_that_was_away_meanwhile_flies_no_route(
         assert "the page was silent" in pilot.wait("refused", do="route")["why"]
 
 
-# What nobody decides ----------------------------------------------------------------------------------------------
+# Undecided -------------------------------------------------------------------------------------------------------
 
 
 def go_to(client: TestClient, pilot: Page) -> None:

@@ -22,7 +22,7 @@ Flight = tuple[RunSummary, Feedback]
 
 #: What an example must have printed.
 PRINTS = {"pictures, in order": "pictures, in order: True", "lost in {": "lost in 0 of 20 frames"}
-#: What stands for a file of the reader's: something that was recorded from a real vehicle.
+#: Recordings of real vehicles that replace the reader's own files.
 FILES = {"flight.pave": "ardrone2/video-8s.pave"}
 
 

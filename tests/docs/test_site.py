@@ -41,7 +41,7 @@ def test_what_other_packages_leave_out_is_shown_with_skyloop() -> None:
 
 
 def test_the_reference_has_each_command_with_its_options() -> None:
-    """What becomes of it in the site is checked by ``make docs``."""
+    """``make docs`` checks the result in the site."""
     text = runpy.run_path(str(ROOT / "scripts" / "command_reference.py"))["reference"]()
     sections = dict(re.findall(r"^\.\. program:: skyloop (.+)\n((?:(?!\.\. program::).*\n)*)", text, re.MULTILINE))
     assert set(COMMANDS) <= set(sections)

@@ -1,4 +1,4 @@
-"""The command path: what is executed, refused and reported, and how often."""
+"""The command path: execution, refusals, and reports at a limited rate."""
 
 from __future__ import annotations
 

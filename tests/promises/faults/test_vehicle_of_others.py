@@ -297,7 +297,7 @@ def ready(scene: Scene) -> Drone:
 
 
 def stays_down(scene: Scene, proxy: Proxy) -> None:
-    """Check that it stays disarmed on the ground for some seconds of its own time."""
+    """Check that it stays disarmed on the ground for some simulated seconds."""
     wait_until(lambda: not scene.armed, "it stands")
     scene.watched(proxy, 150)
     assert not scene.armed

@@ -211,7 +211,7 @@ class Intruder:
         return packet, attachment
 
     def send(self, way: str, sample: Sample, *, who: str | None = None, connection: str | None = None) -> None:
-        """Send as an application, with one of its own keys or another user's."""
+        """Send as an application, with its own key or another user's."""
         key = layout.upward(way, DRONE, who or self.who, connection or self.id)
         self.put(key, encode(sample))
 

@@ -218,7 +218,7 @@ def about_to_rise(autopilot: int) -> Bench:
 
 @AUTOPILOTS
 def test_a_pilot_who_takes_the_vehicle_before_it_is_armed_keeps_it(autopilot: int) -> None:
-    """Its mode was asked for again, and it was armed and took off."""
+    """The mode was requested again, and the vehicle was armed and took off."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
