@@ -1,4 +1,4 @@
-"""``import skyloop`` is quick, and offers what it says."""
+"""``import skyloop`` is quick, and provides its documented names."""
 
 from __future__ import annotations
 

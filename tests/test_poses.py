@@ -1,4 +1,4 @@
-"""Poses against what is known of them, and against the truth of a simulated flight."""
+"""Poses compared with known values, and with the truth of a simulated flight."""
 
 from __future__ import annotations
 

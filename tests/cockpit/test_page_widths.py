@@ -1,4 +1,4 @@
-"""The buttons that stop and land are on the screen: at every width and zoom, with long words, long names and alarms."""
+"""The stop and landing buttons are on the screen: at every width and zoom, with long words, long names and alarms."""
 
 from __future__ import annotations
 

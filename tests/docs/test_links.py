@@ -1,4 +1,4 @@
-"""What the pages point to is there."""
+"""Links and files named on the pages exist."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A promise on a page is held by a test, which has to be there."""
+"""The tests that the pages name for their promises exist."""
 
 from __future__ import annotations
 

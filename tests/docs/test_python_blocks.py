@@ -1,4 +1,4 @@
-"""Every Python example of the pages runs as it stands, but for shorter flights."""
+"""Every Python example on the pages runs unchanged, except for shorter flights."""
 
 from __future__ import annotations
 

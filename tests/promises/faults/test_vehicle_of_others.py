@@ -1,6 +1,7 @@
 """A vehicle that others fly, land or take over in flight: an emulated autopilot commanded by two programs.
 
-The other ground station says its commands on another link. What the proxy said is counted where the autopilot hears it.
+The other ground station sends its commands on another link. The proxy's commands are counted where the autopilot
+receives them.
 """
 
 from __future__ import annotations
