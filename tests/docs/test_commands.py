@@ -74,7 +74,7 @@ INSTALLS = sorted(
 
 
 @pytest.mark.parametrize("line", INSTALLS)
-def test_extras_that_are_to_be_installed_exist(line: str) -> None:
+def test_extras_to_install_exist(line: str) -> None:
     assert set(words(line)[2:]) <= {*EXTRAS, "all"}
 
 

@@ -882,7 +882,7 @@ def test_from_a_grant_until_the_end_of_the_flight_nothing_is_at_rest(bench: Benc
     assert bench.proxy.at_rest
 
 
-def test_a_broken_link_and_due_feedback_are_no_rest(bench: Bench) -> None:
+def test_a_broken_link_and_due_feedback_are_not_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.LANDED)
     bench.run(1.1)
     bench.driver.link(LinkState.UP)

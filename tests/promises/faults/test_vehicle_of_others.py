@@ -233,7 +233,7 @@ def test_a_safety_pilot_keeps_the_vehicle_on_a_route(kind: Kind, note: Path) -> 
 
 
 @KINDS
-def test_a_new_order_takes_it_back(kind: Kind, note: Path) -> None:
+def test_a_new_command_takes_the_vehicle_back(kind: Kind, note: Path) -> None:
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with taken_off(scene) as drone:

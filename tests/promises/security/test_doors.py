@@ -181,7 +181,7 @@ REQUESTS: dict[str, Callable[[Rig], AnyRequest]] = {
 
 @pytest.mark.parametrize("what", [*ORDERS, *REQUESTS])
 @pytest.mark.parametrize("who", ["olga", "bob", "kim"])
-def test_an_order_by_the_key_for_questions_is_refused_and_reported(
+def test_a_command_sent_by_the_key_for_queries_is_refused_and_reported(
     rig: Rig, joined: Callable[[str], Intruder], who: str, what: str
 ) -> None:
     """The one key by which an observer reaches the proxy carries no orders, whoever uses it."""

@@ -592,7 +592,7 @@ def test_our_landing_is_requested_again_if_the_vehicle_is_found_holding(autopilo
 
 
 @AUTOPILOTS
-def test_a_late_mode_of_our_own_is_no_other_operators(autopilot: int) -> None:
+def test_a_late_mode_of_our_own_is_not_another_operators(autopilot: int) -> None:
     """A pilot is back while the failsafe's mode is still on its way: the guided mode is requested again."""
     bench = steering(autopilot)
     bench.apply(Hover(), alone=True)
