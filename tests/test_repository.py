@@ -47,7 +47,7 @@ def tracer() -> ModuleType:
 
 
 def report(total: float, **modules: float) -> dict[str, Any]:
-    """What ``coverage json`` writes, of modules whose dots stand for slashes."""
+    """Return a report as written by ``coverage json``; dots in the names of modules replace slashes."""
     files = {
         f"src/skyloop/{name.replace('__', '/')}.py": {"summary": {"percent_covered": percent}, "missing_lines": [3, 5]}
         for name, percent in modules.items()

@@ -34,7 +34,7 @@ SIZES = ["320×240", "1920×1080"]
 #: Median delays of the made-up results [µs], times 10 with the large frames.
 MEDIANS = {"floor": 50, "skyloop": 60, "ros2": 600}
 MACHINE = Machine("A processor", 2, "An OS", "Linux 6.1", "3.11.7", {}, 0.1)
-#: Cores in use that make the costs of one come out as round numbers.
+#: Cores in use that result in round unit costs.
 CPU = {
     Case(1, 0, video=False): {"proxies": 0.010, "pilot": 0.005},
     Case(1, OBSERVED, video=False): {"proxies": 0.010 + 0.0032, "observers": 0.032},
@@ -131,7 +131,7 @@ def test_the_stages_of_a_trip() -> None:
 
 
 def slower(folder: Path, factor: float, contender: str, share: float = 1.0) -> Path:
-    """A run like the one on the page, with some of its figures multiplied."""
+    """Return the page's run with some of its figures multiplied."""
 
     def changed(cell: delays.Cell) -> delays.Cell:
         by = share * (factor if cell.contender == contender else 1.0)

@@ -251,7 +251,7 @@ def test_chained_errors_are_both_shown_without_skyloops_lines() -> None:
 
 
 def test_errors_begin_with_the_line_in_the_users_code() -> None:
-    """Their own line comes first, not one of the library they called, nor of the loop that called them."""
+    """The user's line comes first, not a line of the library they called, or of the loop that called them."""
 
     def on_frame() -> object:
         return json.loads("{")

@@ -36,7 +36,7 @@ pytest.importorskip("av", reason="H.264 needs: skyloop install video")
 NO_DECODER: Final = "delete window.VideoDecoder"
 BROKEN: Final = "VideoDecoder.prototype.decode = () => { throw new Error('broken') }"
 INSECURE: Final = "Object.defineProperty(window, 'isSecureContext', { value: false })"
-#: Loses what comes over WebSockets in binary while ``window.lose`` is above 0, and notes what is sent.
+#: Drops binary WebSocket messages while ``window.lose`` is above 0, and records sent messages.
 LOSES: Final = """
 window.lose = 0;
 window.said = [];

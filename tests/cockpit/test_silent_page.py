@@ -111,7 +111,7 @@ def test_a_returning_page_continues_without_its_earlier_commands() -> None:
 
 @pytest.mark.parametrize("sticks", [Velocity(forward=0.5), Attitude(pitch=0.1)])
 def test_sticks_from_before_a_short_silence_do_not_fly_on_beside_its_signs_of_life(sticks: Velocity | Attitude) -> None:
-    """It was too short for the failsafe, and ``Idle`` leaves a vehicle as it is: it flew on by them without end."""
+    """It was too short for the failsafe, and ``Idle`` changes nothing: the vehicle kept flying by those sticks."""
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)

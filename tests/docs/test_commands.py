@@ -27,7 +27,7 @@ def words(line: str) -> list[str]:
 
 
 def parse(name: str, arguments: list[str]) -> None:
-    """Raises what the command line would tell the user."""
+    """Parse a command line; raise the error that the user would see."""
     command = GROUP.commands[name]  # type: ignore[attr-defined]
     command.make_context(name, list(arguments))
 

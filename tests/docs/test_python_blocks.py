@@ -15,7 +15,7 @@ from skyloop.messages import Feedback
 from tests.support.pages import Block, blocks
 from tests.support.recordings import recorded
 
-LONGEST_RUN_S = 10.0  # of a controller, whatever the example says
+LONGEST_RUN_S = 10.0  # of a controller, regardless of the example
 BLOCKS = blocks("python")
 FIRST = next(block for block in BLOCKS if block.page.name == "README.md")
 Flight = tuple[RunSummary, Feedback]

@@ -1,4 +1,4 @@
-"""Repeated events: the first is published at once, the others as sums, and nothing is kept for ever."""
+"""Repeated events: the first is published at once, the others as sums, and nothing is kept forever."""
 
 from __future__ import annotations
 

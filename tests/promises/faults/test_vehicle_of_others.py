@@ -182,7 +182,7 @@ def test_a_safety_pilot_keeps_the_vehicle_whatever_the_program_does(
     kind: Kind, end: Callable[[Drone], None], note: Path
 ) -> None:
     """A bug in a callback, a released key, the end of ``skyloop fly``, of a swarm or of a block: the library never
-    takes the vehicle from whoever selected a mode unless the program orders it.
+    takes the vehicle from whoever selected a mode unless the program requests it.
     """
     with Scene(kind, note) as scene:
         proxy = scene.proxy()

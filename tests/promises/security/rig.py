@@ -238,7 +238,7 @@ class Intruder:
         return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
 
     def join(self, who: str | None = None) -> bool:
-        """Open a connection, with its token, as the layout of keys says; returns whether the proxy agreed."""
+        """Open a connection, with its token, as the key layout requires; return whether the proxy agreed."""
         who = who or self.who
         self.listen(layout.to(DRONE, self.id))
         self.held.append(self.session.liveliness().declare_token(layout.app(DRONE, who, self.id)))

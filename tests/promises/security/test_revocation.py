@@ -167,7 +167,7 @@ def test_no_new_connection_is_made_to_a_user_revoked_meanwhile(tmp_path: Path) -
 
 
 def test_an_application_moves_on_to_the_proxy_that_has_the_key(routed: Rig) -> None:
-    """An impostor says first that it is the proxy, and answers queries."""
+    """An impostor is the first to claim to be the proxy, and answers queries."""
     false = "0" * 16
     hub = routed.intruder("hub")
     key = layout.info(DRONE)

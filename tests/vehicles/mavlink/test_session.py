@@ -223,7 +223,7 @@ def test_its_clock_is_mapped_to_ours_by_timesync() -> None:
     bench.hear(m.MAVLink_timesync_message(theirs_ns, question.ts1))
     assert bench.session.clock.round_trip_s is not None
     boot_ms = bench.vehicle.boot_ms
-    bench.clock.advance(0.1)  # the message arrives 100 ms late and says when it was sent
+    bench.clock.advance(0.1)  # the message arrives 100 ms late, with its sending time
     bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
     assert bench.clock() - bench.newest.captured_ns == pytest.approx(100e6, abs=5e6)
 
