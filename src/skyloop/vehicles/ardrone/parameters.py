@@ -139,8 +139,8 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
     return found
 
 
-def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value; raise an error if the name or value is invalid."""
+def prepare_write(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
+    """Return the entry and the text to write for a new value; raise an error if the name or value is invalid."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -149,7 +149,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
     return entry, entry.to_text(value)
 
 
-def taken(entry: Entry, wanted: str, reported: str) -> bool:
+def is_confirmed(entry: Entry, wanted: str, reported: str) -> bool:
     """Return whether the drone reports the written value, regardless of its number format."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)

@@ -45,16 +45,16 @@ class UdpListener:
 
     def receive(self) -> list[tuple[bytes, Peer]]:
         """Return up to :data:`BURST` received datagrams, each with its sender."""
-        came: list[tuple[bytes, Peer]] = []
+        received: list[tuple[bytes, Peer]] = []
         for _ in range(BURST):
             try:
                 data, source = self._socket.recvfrom(MAX_DATAGRAM)
-                came.append((data, _peer_of(source)))
+                received.append((data, _peer_of(source)))
             except BlockingIOError:
                 break
             except ConnectionError:  # ICMP port unreachable, but the peer may come back
                 continue
-        return came
+        return received
 
     def send(self, packet: Packet) -> None:
         """Send a datagram; drop it if there is no peer yet or the buffer is full."""
@@ -199,10 +199,10 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     # On the link's thread ----------------------------------------------------------------------------------------
 
     def _read(self, connection: MavlinkConnection) -> None:
-        came = connection.receive()
+        received = connection.receive()
         now_ns = self._clock()
         with self.lock:
-            for data, peer in came:
+            for data, peer in received:
                 self.session.receive(data, peer, now_ns, whole=connection.whole)
 
     def _send_due(self, now_ns: int) -> None:

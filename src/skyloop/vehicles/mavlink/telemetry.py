@@ -265,7 +265,7 @@ def feedback_of(
     """Return the vehicle's state in our units and axes. Values that are outdated or not finite are None."""
     attitude = telemetry.attitude(now_ns)
     position = telemetry.position(now_ns)
-    roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
+    roll, pitch, yaw = (None, None, None) if attitude is None else _to_our_axes(attitude)
     return Feedback(
         captured_ns=captured_ns,
         state=state,
@@ -283,7 +283,7 @@ def feedback_of(
     )
 
 
-def _turned_over(attitude: Vector) -> Vector:
+def _to_our_axes(attitude: Vector) -> Vector:
     """Convert to roll (positive right side down), pitch (positive nose down) and yaw (counter-clockwise from east)."""
     roll, pitch, yaw = attitude
     return math.remainder(roll, math.tau), 0.0 - math.remainder(pitch, math.tau), yaw_between(yaw)
