@@ -280,7 +280,7 @@ class SetpointController:
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
         self._passed_ns += passed_ns
-        in_a_row = 2 * gap_ns < passed_ns  # a burst of delayed navdata; otherwise there is no backlog
+        in_a_row = 2 * gap_ns < passed_ns  # arrives over twice as fast as it was sent: a burst of delayed navdata
         if gap_ns >= SILENT_NS and self._received_ns:
             self._late_ns = gap_ns - passed_ns
         elif self._late_ns:

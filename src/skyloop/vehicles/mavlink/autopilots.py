@@ -259,7 +259,7 @@ class Px4Profile(AutopilotProfile):
         _SafetyNet(
             "COM_OBL_RC_ACT",
             "loss of set-points",
-            lambda action: action in (3, 4, 5),
+            lambda action: action in (3, 4, 5),  # return, land, hold
             "without a remote control it sinks to the ground",
             5,
         ),

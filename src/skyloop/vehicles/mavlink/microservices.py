@@ -172,7 +172,7 @@ class CommandSender:
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
         if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
-            times = 0  # this is a new request, not a repeat
+            times = 0  # a new request: the confirmation field counts only repeats
         self._sent[command] = now_ns, times + 1
         arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
         self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
