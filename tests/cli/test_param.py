@@ -106,7 +106,7 @@ def test_all_some_and_one_are_shown(run: Run, alpha: Process) -> None:
     some = run("param", "alpha", "limits").out.splitlines()[1:]
     assert len(some) > 2
     assert all(line.startswith("limits.") for line in some)
-    assert "maximum roll and pitch" in run("param", "alpha", "limits.tilt").out
+    assert "greatest roll and pitch" in run("param", "alpha", "limits.tilt").out
     (one,) = json.loads(run("param", "alpha", "limits.tilt", "--json").out)
     assert (one["name"], one["unit"]) == ("limits.tilt", "rad")
 
