@@ -302,7 +302,7 @@ _TRIM: Final = _switch(
 )
 _CALIBRATE: Final = _switch(
     "ardrone.calibrate_magnetometer",
-    "true: the drone turns once on the spot to calibrate it (CALIB); only in flight",
+    "true: the drone turns once on the spot to calibrate its magnetometer (CALIB); only in flight",
     momentary=True,
 )
 _ABSOLUTE: Final = _switch(

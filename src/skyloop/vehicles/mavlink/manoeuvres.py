@@ -15,7 +15,7 @@ from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-# Frames (MAV_FRAME) that both autopilots accept in SET_POSITION_TARGET_LOCAL_NED, and its type masks: ignored fields.
+# Frames (MAV_FRAME) that both autopilots accept in SET_POSITION_TARGET_LOCAL_NED, and type masks of ignored fields.
 WORLD: Final = 1
 BODY: Final = 8  #: levelled body axes
 VELOCITY_AND_YAW_RATE: Final = 0x5C7

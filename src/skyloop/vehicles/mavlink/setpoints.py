@@ -314,7 +314,7 @@ class SetpointController:
         """Return the set-points that are due, and pass commands to the command sender.
 
         ``read``: whether the vehicle seems to process commands promptly, judging by its messages. If not, a changed
-        velocity might wait in a buffer and take effect late, so zero is sent instead, which is harmless even when late.
+        velocity might wait in a buffer and take effect late, so zero velocity is sent, which is harmless even if late.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None

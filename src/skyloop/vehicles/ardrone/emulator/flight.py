@@ -118,7 +118,7 @@ class FlightControl:
     # Commands --------------------------------------------------------------------------------------------------
 
     def ref(self, bits: int) -> None:
-        """Handle ``REF``: take off, land, toggle the emergency. Some programs omit the fixed bits, so accept that."""
+        """Handle ``REF``: take off, land, toggle the emergency. Fixed bits are not checked: some programs omit them."""
         self.start = bool(bits & Ref.TAKEOFF)
         if bits & Ref.EMERGENCY:
             if self._toggle_ready:

@@ -28,7 +28,7 @@ AtMessage: TypeAlias = tuple[str, tuple[Argument, ...]]
 class Ref(IntFlag):
     """Bits of ``REF``."""
 
-    EMERGENCY = 1 << 8  #: each change from 0 to 1 cuts the motors or, in an emergency, ends it
+    EMERGENCY = 1 << 8  #: each change from 0 to 1 cuts the motors or, in an emergency, ends the emergency
     TAKEOFF = 1 << 9  #: 1: take off and stay in the air; 0: land and stay on the ground
     FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28: the guide requires them, but no drone seems to need them
 

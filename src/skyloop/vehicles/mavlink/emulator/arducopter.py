@@ -262,7 +262,7 @@ class ArduCopter(Autopilot):
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return the target with an absolute position, which is relative to the vehicle in all frames but one."""
+        """Return the target with its position made absolute: in all frames but one, it is relative to the vehicle."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target
