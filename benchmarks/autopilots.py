@@ -42,19 +42,19 @@ class Spread(msgspec.Struct, frozen=True):
 
     @staticmethod
     def of(errors: list[float]) -> Spread:
-        """Return the spread of some errors."""
+        """Return the spread of these errors."""
         return Spread(math.sqrt(sum(e * e for e in errors) / len(errors)), max(map(abs, errors)))
 
 
 class AgreementRow(msgspec.Struct, frozen=True):
-    """The firmware's own state compared with the truth, over a time in the air."""
+    """The firmware's own state compared with the truth during a time in the air."""
 
     seconds: float
     samples: int
     roll_deg: Spread
     pitch_deg: Spread
     yaw_deg: Spread
-    position_m: Spread | None  #: distance; None: position not reported
+    position_m: Spread | None  #: distance; None if no position was reported
     position_wander_m: Spread | None  #: the same without its mean, the GPS error during the flight
 
 
@@ -62,8 +62,8 @@ class FlightRow(msgspec.Struct, frozen=True):
     """One run. Times from connecting [s]."""
 
     autopilot: str
-    ready_s: float  #: until it took off
-    corners: int  #: of the square, flown to
+    ready_s: float  #: time until it took off
+    corners: int  #: number of corners reached
     agreement: AgreementRow
     marker_frames: int
     marker_in_view: float | None
@@ -164,7 +164,7 @@ def fly_square(drone: skyloop.Drone, seconds: float, least_corners: int = 0) -> 
         x, y = SQUARE[corners % len(SQUARE)]
         try:
             drone.go_to(x=x, y=y, z=HEIGHT_M, speed=0.8, timeout_s=30.0, tolerance_m=0.3)
-        except RefusedError:  # a busy computer: it hovered meanwhile, so send it on
+        except RefusedError:  # the computer was busy and the drone hovered meanwhile: fly on
             time.sleep(0.5)
         else:
             corners += 1
@@ -172,7 +172,7 @@ def fly_square(drone: skyloop.Drone, seconds: float, least_corners: int = 0) -> 
 
 
 def follow(drone: skyloop.Drone, seconds: float) -> FollowMarker:
-    """Follow the demo's marker by the demo's controller."""
+    """Follow the demo's marker with the demo's controller."""
     follower = FollowMarker(drone, MARKER_ID)
     follower.run(seconds=seconds)
     return follower
@@ -182,7 +182,7 @@ def fly(autopilot: str, square_s: float, follow_s: float, say: Callable[[str], o
     """Fly everything in one flight.
 
     Raises:
-        SkyloopError: It could not be started, did not take off, or did not reach a corner.
+        SkyloopError: The firmware could not be started, did not take off, or did not reach a corner.
     """
     begun_s = time.monotonic()
     with skyloop.connect(address(autopilot, **options), timeout_s=30.0) as drone:

@@ -6,7 +6,7 @@ without a decoder; then one drone's pane in both. It needs Chromium and ``pip in
 
 An age runs from a frame's capture until the browser begins the animation frame that shows it, on one clock: the page's
 clock is compared with this process's. Loads are of one core, from the processor time of each process and its children:
-on a busy machine they remain meaningful, while the number of frames depends on the machine. The load before and after
+on a busy machine they remain meaningful, unlike the number of frames. The load before and after
 is printed.
 """
 
@@ -53,14 +53,14 @@ new MutationObserver((changes) => {
 """
 _NO_DECODER: Final = "delete window.VideoDecoder"
 _PANES: Final = "[...document.querySelectorAll('.tile, .camera')].map((pane) => pane.dataset.form ?? '')"
-_TRIES: Final = 30  # readings of the page's clock: the quickest counts
+_TRIES: Final = 30  # readings of the page's clock, of which the quickest counts
 
 
 class Moment(NamedTuple):
-    """The counts up to some time."""
+    """The counts up to a moment."""
 
     at_s: float
-    bytes: int  #: received by the page over WebSockets
+    bytes: int  #: bytes received by the page over WebSockets
     cpu_s: dict[str, float]  #: by part
 
 
@@ -70,7 +70,7 @@ class Watched(NamedTuple):
     name: str
     panes: int
     seconds: float
-    ages_s: list[float]  #: of all frames shown
+    ages_s: list[float]  #: age of each frame shown
     bytes: int
     cpu_s: dict[str, float]  #: by part
 

@@ -31,7 +31,7 @@ from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder
 from skyloop.vehicles.emulation.video import GROUP, Encoder
 
-UVLC_PER_S: Final = 15.0  #: the target: the rate of an AR.Drone 1
+UVLC_PER_S: Final = 15.0  #: target: the frame rate of an AR.Drone 1
 PICTURES: Final = 2 * GROUP  #: two groups of H.264 pictures, each with a key frame
 UVLC_PICTURES: Final = 6  #: each is independent of the others
 BITRATE_KBPS: Final = 4000  #: of H.264, the maximum requested from the drone
@@ -45,7 +45,7 @@ class CodecRow(msgspec.Struct, frozen=True):
 
     what: str
     of: str
-    size: int  #: bytes of one, encoded, on average
+    size: int  #: mean encoded size [bytes]
     once: Spread
     per_s: float  #: on one core
     target: float | None = None
@@ -67,7 +67,7 @@ def measure(seconds: float, progress: Progress = lambda _: None) -> CodecResults
 
     Args:
         seconds: Approximate duration, plus the time for drawing the pictures [s].
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     machine = Machine.here()  # with all its cores
     with Workers() as workers:
@@ -82,7 +82,7 @@ def measure_here(seconds: float, progress: Progress = lambda _: None) -> CodecRe
 
     Args:
         seconds: Approximate duration, plus the time for drawing the pictures [s].
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     rows: list[CodecRow] = []
     skipped: dict[str, str] = {}
@@ -105,7 +105,7 @@ def measure_here(seconds: float, progress: Progress = lambda _: None) -> CodecRe
     try:
         stream = h264(large)
         title = f"a rendered picture, {H264_360P.width}×{H264_360P.height}"
-        # The first may follow the last: it is a key frame.
+        # The first may follow the last, because it is a key frame.
         show = partial(PaveVideo().decode, show=True)
         come = [Coded(frame, frame.is_key, 0, 0, 0) for frame in stream]
         add("H.264, decode to BGR", title, [len(f.payload) for f in stream], [partial(show, one) for one in come])

@@ -67,14 +67,14 @@ def loop(sizes: Sizes = None, seconds: Seconds = None, minutes: Minutes = None, 
 def load(
     observers: Annotated[str | None, typer.Option(help="Numbers of observers, one case each [default: 1,8,32]")] = None,
     slow_processor: Annotated[
-        bool, typer.Option("--slow-processor/--no-slow-processor", help="A processor of 200 ms per frame")
+        bool, typer.Option("--slow-processor/--no-slow-processor", help="A processor that takes 200 ms per frame")
     ] = True,
-    stuck: Annotated[bool, typer.Option("--stuck/--no-stuck", help="One of 8 observers stopped")] = True,
+    stuck: Annotated[bool, typer.Option("--stuck/--no-stuck", help="8 observers, one of which is stopped")] = True,
     recorder: Annotated[
         bool, typer.Option("--recorder/--no-recorder", help="Record 640x480 at 30 frames per second")
     ] = True,
     disk_full: Annotated[
-        bool, typer.Option("--disk-full/--no-disk-full", help="The same to a disk that fills up")
+        bool, typer.Option("--disk-full/--no-disk-full", help="The same, to a disk that fills up")
     ] = True,
     record_to: Annotated[Path | None, typer.Option(help="Folder for the recorder")] = None,
     pages: Annotated[
@@ -141,12 +141,12 @@ def codecs(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
 
 
 def network(
-    losses: Annotated[str | None, typer.Option(help="Shares of packets lost [default: 0,0.01,0.1,0.3]")] = None,
+    losses: Annotated[str | None, typer.Option(help="Fractions of packets lost [default: 0,0.01,0.1,0.3]")] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure the channels between two hosts with a lossy path between. Needs root."""
+    """Measure the channels between two hosts over a lossy path. Needs root."""
     from benchmarks import network, tables
 
     wanted_s, shares = duration_s(seconds, minutes), parse_shares(losses)
@@ -237,7 +237,7 @@ def learning(seconds: Seconds = None, minutes: Minutes = None, output: Output = 
 def ros(
     ros_python: Annotated[
         str | None,
-        typer.Option(help="The Python that has rclpy and Skyloop [default: $SKYLOOP_ROS_PYTHON or this one]"),
+        typer.Option(help="Python interpreter with rclpy and Skyloop [default: $SKYLOOP_ROS_PYTHON or this one]"),
     ] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
@@ -254,13 +254,13 @@ def ros(
 
 def recordings(
     encode: Annotated[
-        bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
+        bool, typer.Option("--encode/--no-encode", help="Also measure the export that encodes each picture")
     ] = True,
     seconds: Annotated[float | None, typer.Option(min=1.0, help="Length of the flight [default: 600]")] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="The same in minutes")] = None,
     output: Output = None,
 ) -> None:
-    """Measure how long it takes to open, look at, seek in and export a recording."""
+    """Measure how long it takes to open, inspect, seek in and export a recording."""
     from benchmarks import recordings
 
     flight = 600.0 if seconds is minutes is None else duration_s(seconds, minutes)
@@ -271,14 +271,14 @@ def recordings(
 
 def video_path(
     traces: Annotated[
-        str | None, typer.Option(help="Uplinks, with commas [default: the recorded ones, or synthetic]")
+        str | None, typer.Option(help="Uplinks, comma-separated [default: the recorded ones, or synthetic]")
     ] = None,
-    contenders: Annotated[str | None, typer.Option(help="Beginnings of names, with commas [default: all]")] = None,
+    contenders: Annotated[str | None, typer.Option(help="Prefixes of names, comma-separated [default: all]")] = None,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
 ) -> None:
-    """Measure video over the uplinks of mobile networks, replayed, beside WebRTC. Needs root."""
+    """Measure video over replayed uplinks of mobile networks, beside WebRTC. Needs root."""
     from benchmarks import video_path
     from benchmarks.hosts.traces import find
     from benchmarks.video_path_figure import draw
@@ -328,12 +328,12 @@ def parse_numbers(text: str | None, default: str = "1,8,32", option: str = "--ob
     """
     words = [word.strip() for word in (default if text is None else text).split(",")]
     if not all(word.isdecimal() and int(word) <= 100 for word in words):
-        raise UsageError(f"{option} is {text!r} and must be numbers up to 100 with commas, such as 1,8,32")
+        raise UsageError(f"{option} is {text!r} and must be comma-separated numbers up to 100, such as 1,8,32")
     return [int(word) for word in words]
 
 
 def parse_shares(text: str | None) -> list[float]:
-    """Parse shares such as ``0,0.1``.
+    """Parse fractions such as ``0,0.1``.
 
     Raises:
         UsageError: The text is anything else.
@@ -347,20 +347,20 @@ def parse_shares(text: str | None) -> list[float]:
     except ValueError:
         shares = [math.nan]
     if not all(0.0 <= share < 1.0 for share in shares):
-        raise UsageError(f"--losses is {text!r} and must be shares from 0 to below 1 with commas, such as 0,0.1,0.3")
+        raise UsageError(f"--losses is {text!r} and must be fractions from 0 to below 1, such as 0,0.1,0.3")
     return list(dict.fromkeys(shares))
 
 
 def parse_words(text: str | None) -> tuple[str, ...]:
-    """Parse names with commas between them."""
+    """Parse comma-separated names."""
     return tuple(word.strip() for word in (text or "").split(",") if word.strip())
 
 
 def parse_beginnings(text: str | None, names: Sequence[str]) -> list[str]:
-    """Return the names that begin with one of the words, in upper or lower case; all without a word.
+    """Return the names that begin with one of the words, ignoring case; without words, return all names.
 
     Raises:
-        UsageError: No name begins so.
+        UsageError: No name begins with one of the words.
     """
     words = [word.lower() for word in parse_words(text)]
     for word in words:

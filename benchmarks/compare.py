@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.compare results`` reads the output of ``python -m benchmarks.… --output results`` (and of
 ``skyloop bench sim --json``, as ``sim.json``), and compares it with ``docs/measured``, or with a second folder. Delays
-are compared as multiples of the bare hand-over's in their own run, so that a faster or busier machine changes nothing;
+are compared as multiples of the bare hand-over's delays in their own run, so that the machine's speed cancels out;
 the simulator, which has no such floor, is compared as measured, which is only meaningful on one machine.
 
 Figures more than :data:`WORSE` times as slow as before are marked, and the exit status is then 1.
@@ -35,13 +35,13 @@ WORSE: Final = 1.15  #: medians of one machine vary by less from run to run, as 
 
 
 class Change(NamedTuple):
-    """A figure in both runs: the smaller the better."""
+    """A figure that is in both runs; smaller is better."""
 
     what: str
     unit: str
     before: float
     now: float
-    judged: bool = True  #: whether a large increase counts as a loss; 99th percentiles vary too much
+    judged: bool = True  #: whether a large increase counts as worse; 99th percentiles vary too much
 
     @property
     def ratio(self) -> float:
@@ -50,7 +50,7 @@ class Change(NamedTuple):
 
     @property
     def worse(self) -> bool:
-        """Whether it is a loss."""
+        """Whether the figure has become worse."""
         return self.judged and self.ratio > WORSE
 
 
@@ -62,7 +62,7 @@ def compare(now: Path, before: Path) -> list[Change]:
         before: Folder with the results to compare with.
 
     Raises:
-        UsageError: They have no results in common.
+        UsageError: The folders have no results in common.
         FileFormatError: A file is not a results file.
     """
     found = [*_delays(now, before), *_loop(now, before), *_sim(now, before)]

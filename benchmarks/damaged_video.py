@@ -1,4 +1,4 @@
-"""Measure how much video is shown after losing datagrams, and how much of it correctly.
+"""Measure how much of a video is shown after a loss of datagrams, and how much of that correctly.
 
 The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, ``tests/support/recordings.py``) is sent in
 three ways: in pieces of the drone's stream; re-encoded in the emulated Tello's datagrams at its bit rate; and in pieces
@@ -50,14 +50,14 @@ Remains = list[list[bytes]]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """The pictures shown of one stream with one loss, over all seeds."""
+    """The pictures shown of one stream at one rate of loss, over all seeds."""
 
     stream: str
     loss: float
     decoder: str
-    shown: float  #: share of the pictures
-    right: float  #: share of those shown
-    worst_db: float  #: the least PSNR of a picture shown [dB]
+    shown: float  #: fraction of the pictures
+    right: float  #: fraction of those shown
+    worst_db: float  #: lowest PSNR of a picture shown [dB]
 
 
 def psnr(one: Pixels, other: Pixels) -> float:
@@ -72,7 +72,7 @@ def cut(data: bytes, size: int) -> list[bytes]:
 
 
 def lost(stream: list[list[bytes]], share: float, seed: int) -> Remains:
-    """Return the remaining pieces of pictures after losing this share."""
+    """Return the pieces of pictures that remain after losing this fraction."""
     chance = random.Random(seed)
     return [[piece for piece in picture if chance.random() >= share] for picture in stream]
 

@@ -27,9 +27,9 @@ from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
 WORLDS: Final = ("street", "yard")
 SEEDS: Final = (9001, 9002, 9003, 9004)
-SCORE: Final = 0.4  #: of ``simulated_detector``
+SCORE: Final = 0.4  #: minimum score of ``simulated_detector``
 LEAST_PX, LEAST_VISIBLE, LEAST_CUT_PX = 14, 0.5, 8
-_SEEN: Final = 0.02  # a thing with a smaller visible share is not in the picture
+_SEEN: Final = 0.02  # an object with a smaller visible fraction is not in the picture
 _TILT: Final = math.radians(20)
 _LOW: Final = 0.05  # minimum score of detections that count for the average precision
 _HEIGHTS: Final = ((8, 14), (14, 24), (24, 48), (48, 96), (96, 1000))
@@ -41,7 +41,7 @@ Judge = Callable[[TargetBox, float], bool]
 
 
 def counts(box: TargetBox, scale: float = 1.0) -> bool:
-    """Return whether a thing must be found; ``scale`` from the picture to one 320 pixels wide."""
+    """Return whether an object must be found; ``scale`` is that from the picture to one 320 pixels wide."""
     return scale * box.box[3] >= LEAST_PX and box.visible >= LEAST_VISIBLE and _in_view(box, scale)
 
 
@@ -78,7 +78,7 @@ def _corners(boxes: Sequence[Sequence[float]]) -> Any:
 
 
 def conditions(count: int) -> Iterator[tuple[str, list[Picture]]]:
-    """Yield a description of pictures, and the pictures: ``count`` of each world and seed."""
+    """Yield descriptions of pictures, each with the pictures: ``count`` of each world and seed."""
     rng = np.random.default_rng(1)
     plain = list(held_back(count))
 

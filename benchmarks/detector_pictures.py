@@ -1,7 +1,7 @@
 """Pictures of the simulator's figures for a detector: for training, and degraded as by a camera or a codec.
 
 Every picture has its true boxes. Figures and crates stand at random places, in the shipped worlds and in invented ones,
-so that a detector learns their appearance, not their places.
+so that a detector learns their appearance, not their positions.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from skyloop.sim.world import (
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-PER_WORLD: Final = 30  #: pictures of one world, one camera and one set of looks
-_SHIPPED: Final = ("room", "empty", "gates", "pillars", "platform", "windy")  # of which none has a figure
+PER_WORLD: Final = 30  #: pictures of one world with one camera and one set of appearances
+_SHIPPED: Final = ("room", "empty", "gates", "pillars", "platform", "windy")  # none of these has a figure
 _GROUNDS: Final = ("asphalt", "brick", "carpet", "checker", "concrete", "grass", "metal", "parquet", "tiles", "wood")
 _SIDES: Final = ("brick", "books", "checker", "concrete", "fabric", "grass", "metal", "plaster", "tiles", "wood")
 _HUNG: Final = ("door", "window", "poster_chart", "poster_landscape", "poster_pattern")
-_GAP_M: Final = 0.004  # of things on a wall or the floor, so that they are in front of it
-_NEAREST_M: Final = 0.8  # of a figure to the camera
-_NEAR_M, _FAR_M = 12.0, 36.0  # distances of most, and of the others; at 36 m a person is 12 pixels high
-_PERSON: Final = np.array([[0.35], [0.35], [0.8]])  # space to keep free around one
-_CAR: Final = np.array([[0.75], [0.75], [0.5]])  # and around each half of a car
+_GAP_M: Final = 0.004  # distance of objects from their wall or floor, so that they are in front of it
+_NEAREST_M: Final = 0.8  # minimum distance of a figure from the camera
+_NEAR_M, _FAR_M = 12.0, 36.0  # maximum distance of most figures, and of the others; at 36 m a person is 12 pixels high
+_PERSON: Final = np.array([[0.35], [0.35], [0.8]])  # space to keep free around a person
+_CAR: Final = np.array([[0.75], [0.75], [0.5]])  # space to keep free around each half of a car
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,7 +118,7 @@ def smeared(image: Image, length: float, angle: float) -> Image:
 
 
 def coarse(image: Image, share: float) -> Image:
-    """Reduce an image's resolution to a share of the width and height, and enlarge it again."""
+    """Reduce an image's resolution to a fraction of its width and height, and enlarge it again."""
     rows, columns = image.shape[:2]
     small = cv2.resize(image, (round(columns * share), round(rows * share)), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(small, (columns, rows), interpolation=cv2.INTER_LINEAR), np.uint8)
@@ -135,13 +135,13 @@ def _world(rng: Rng) -> World:
     if kind == "made up":
         return _made_up(rng)
     world = load_world(str(rng.choice(_SHIPPED)) if kind == "shipped" else str(kind), int(rng.integers(1 << 30)))
-    if kind == "shipped":  # half of them stay without figures
+    if kind == "shipped":  # half of these get no figures
         return world if rng.random() < 0.5 else replace(world, targets=world.targets + _figures(rng, 3, 1))
     return replace(world, targets=tuple(_dressed(target, rng) for target in world.targets))
 
 
 def _dressed(target: Target, rng: Rng) -> Target:
-    """Give a figure another look, half of the time."""
+    """Change a figure's appearance, half of the time."""
     if not isinstance(target, FigureTarget) or rng.random() < 0.4:
         return target
     return replace(target, look=int(rng.integers(10_000)), colour=_colour(rng) if rng.random() < 0.5 else None)
@@ -244,7 +244,7 @@ def _posters(rng: Rng, room: Room) -> tuple[Panel, ...]:
 
 
 def _carriers(rng: Rng, room: Room) -> list[Target]:
-    """Return carriers of markers: boards and platforms."""
+    """Return objects that carry markers: boards and platforms."""
     targets: list[Target] = []
     yaw = FixedYaw(float(rng.uniform(-3, 3)))
     if rng.random() < 0.4:
@@ -265,7 +265,7 @@ def _pattern(rng: Rng) -> MarkerPattern:
 
 
 def _camera(rng: Rng) -> CameraModel:
-    """Return the camera of the simulated AR.Drone, or another without distortion, without the flaws of its sensor."""
+    """Return the camera of the simulated AR.Drone, or another without distortion; neither has a sensor's flaws."""
     if rng.random() < 0.35:
         return replace(FRONT_CAMERA, noise_sigma=0.0, vignetting=0.0, position_m=(0.0, 0.0, 0.0))
     height = 240 if rng.random() < 0.65 else 180
@@ -305,7 +305,7 @@ def _free_place(world: World, solids: Solids, rng: Rng) -> tuple[NDArray[np.floa
             break
     if rng.random() < 0.1:
         return at, float(rng.uniform(-math.pi, math.pi))
-    # Visible things are placed mostly ahead, where there is room.
+    # Most visible objects are placed ahead, where there is room.
     ahead = math.atan2(-at[1] + rng.normal(0.0, y / 6), -at[0] + rng.normal(0.0, x / 6))
     return at, float(ahead)
 
@@ -341,7 +341,7 @@ def _states(
             ):
                 break
         else:
-            x, y = 500.0, 500.0  # no room for it
+            x, y = 500.0, 500.0  # there is no room for the figure
         taken.append((x, y, radius))
         walked = 0.0 if rng.random() < 0.3 else float(rng.uniform(0.0, 1.5))
         states.append(TargetState(target.name, 0.0, (x, y, 0.0), heading, (0.0, 0.0, 0.0), walked))

@@ -19,9 +19,9 @@ class Matches:
 
     Attributes:
         scores: Scores of the detections, (n,).
-        right: Whether each of them found a true box that counts, (n,).
-        ignored: Whether each of them is neither right nor wrong, because it found one that does not count, (n,).
-        best: The score of the detection that found each true box that counts; -1: none did, (boxes that count,).
+        right: Whether each detection found a true box that counts, (n,).
+        ignored: Whether each detection is neither right nor wrong, because it found a box that does not count, (n,).
+        best: Score of the detection that found each true box that counts, or -1 if it was missed, (boxes that count,).
     """
 
     scores: Floats
@@ -31,15 +31,15 @@ class Matches:
 
 
 def match(found: Floats, scores: Floats, true: Floats, counts: NDArray[np.bool_], least: float = 0.5) -> Matches:
-    """Match the detections of a class in a picture, the most certain first, with the true box they overlap most.
+    """Match each detection of a class in a picture, the most certain first, with the true box that it overlaps most.
 
-    A true box is found once; a detection that finds none is wrong, unless it overlaps one that does not count.
+    A true box is found once; a detection that finds none is wrong, unless it overlaps a box that does not count.
 
     Args:
         found: Corners of the detections, (n, 4).
         scores: Scores of the detections, (n,).
         true: Corners of the true boxes, (m, 4).
-        counts: Whether each of these must be found, (m,).
+        counts: Whether each true box must be found, (m,).
         least: Minimum overlap of a match: shared area over united area.
     """
     right, ignored = np.zeros(len(found), np.bool_), np.zeros(len(found), np.bool_)
@@ -56,7 +56,7 @@ def match(found: Floats, scores: Floats, true: Floats, counts: NDArray[np.bool_]
 
 
 def average_precision(matches: Sequence[Matches]) -> float:
-    """Return the area under precision over recall, precision made monotone as in PASCAL VOC from 2010; NaN: no box.
+    """Return the area under precision over recall, precision made monotone as in PASCAL VOC 2010; NaN without boxes.
 
     Everingham et al., "The PASCAL Visual Object Classes Challenge: A Retrospective", IJCV 2015.
     """
@@ -74,20 +74,20 @@ def average_precision(matches: Sequence[Matches]) -> float:
 
 
 def recall(matches: Sequence[Matches], score: float) -> float:
-    """Return the share of true boxes that were found with at least a score; NaN: there is none."""
+    """Return the fraction of true boxes found with at least this score; NaN if there are none."""
     best = np.concatenate([each.best for each in matches]) if matches else np.zeros(0)
     return float((best >= score).mean()) if best.size else float("nan")
 
 
 def precision(matches: Sequence[Matches], score: float) -> float:
-    """Return the share of detections with at least a score that are right; NaN: there is none."""
+    """Return the fraction of detections with at least this score that are right; NaN if there are none."""
     right = sum(int((each.right & (each.scores >= score)).sum()) for each in matches)
     wrong = false_alarms(matches, score)
     return right / (right + wrong) if right + wrong else float("nan")
 
 
 def balanced_score(matches: Sequence[Matches]) -> float:
-    """Return the score, 0.05 to 0.9, from which detections have the best harmonic mean of recall and precision."""
+    """Return the score, 0.05 to 0.9, above which detections have the best harmonic mean of recall and precision."""
     tried = np.arange(0.05, 0.9, 0.01)
     pairs = [(recall(matches, score), precision(matches, score)) for score in tried]
     means = [2 * found * right / (found + right) if found + right > 0 else 0.0 for found, right in pairs]
@@ -95,5 +95,5 @@ def balanced_score(matches: Sequence[Matches]) -> float:
 
 
 def false_alarms(matches: Sequence[Matches], score: float) -> int:
-    """Return the number of detections with at least a score that found nothing."""
+    """Return the number of detections with at least this score that found nothing."""
     return sum(int((~each.right & ~each.ignored & (each.scores >= score)).sum()) for each in matches)

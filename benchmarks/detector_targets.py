@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRIDES: Final = (8, 16, 32)
-#: By stride: the range of the longer sides of its things [px].
+#: By stride: the range of the longer sides of its objects [px].
 SIZES: Final = ((0.0, 72.0), (40.0, 160.0), (104.0, np.inf))
 NOTHING, IGNORED = -1, -2
-_REACH: Final = 1.0  # strides from a thing's centre
-_LEAST_REACH: Final = 0.75  # for a thing smaller than a stride
+_REACH: Final = 1.0  # distance from an object's centre, in strides
+_LEAST_REACH: Final = 0.75  # the same for an object smaller than a stride
 
 Floats = NDArray[np.float32]
 
@@ -34,12 +34,12 @@ def places(width: int, height: int) -> tuple[Floats, Floats]:
 def assign(boxes: Floats, classes: NDArray[np.int64], grid: tuple[Floats, Floats]) -> tuple[NDArray[np.int64], Floats]:
     """Give each place its target class and box.
 
-    If two things claim a place, the smaller one gets it, as it has fewer. Things that need not be found exclude their
-    remaining places from the count.
+    If two objects claim a place, the smaller one gets it, because it has fewer. Objects that need not be found exclude
+    their remaining places from the count.
 
     Args:
-        boxes: Centre and size of the things [px], (m, 4).
-        classes: Classes of the things, ``IGNORED`` for one that need not be found, (m,).
+        boxes: Centre and size of the objects [px], (m, 4).
+        classes: Classes of the objects, (m,); ``IGNORED`` for an object that need not be found.
         grid: From :func:`places`.
 
     Returns:

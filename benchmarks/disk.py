@@ -14,7 +14,7 @@ from typing import Final
 from skyloop.errors import UsageError
 
 DISK_MB: Final = 3  #: noise of 640x480, recorded as JPEG 30 times a second, fills it within half a second
-MOST_FREE_MB: Final = 16  #: of a folder used instead
+MOST_FREE_MB: Final = 16  #: maximum free space of a folder used instead
 
 
 @contextmanager
@@ -25,7 +25,7 @@ def small_disk(instead: Path | None = None) -> Iterator[Path]:
         instead: A nearly full disk to use where this user may not mount one.
 
     Raises:
-        UsageError: Neither is available; with both reasons.
+        UsageError: Neither is available; the error gives both reasons.
     """
     folder = Path(tempfile.mkdtemp(prefix="bench-disk-"))
     mounted = False
@@ -40,7 +40,7 @@ def small_disk(instead: Path | None = None) -> Iterator[Path]:
 
 
 def _mount(folder: Path) -> str:
-    """Mount it; return the reason of a failure, empty on success."""
+    """Mount it; return why that failed, or an empty string."""
     if os.geteuid() != 0:
         return "only root may mount a small disk"
     command = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m,mode=0700", "tmpfs", str(folder)]
@@ -56,5 +56,5 @@ def _checked(instead: Path | None, problem: str) -> Path:
         raise UsageError(f"{problem}, and --record-to does not name a nearly full one")
     free_mb = shutil.disk_usage(instead).free / 1e6
     if free_mb > MOST_FREE_MB:
-        raise UsageError(f"{problem}, and {instead} has {free_mb:.0f} MB left, more than the {MOST_FREE_MB} to fill")
+        raise UsageError(f"{problem}, and {instead} has {free_mb:.0f} MB left, more than the maximum of {MOST_FREE_MB}")
     return instead

@@ -50,7 +50,7 @@ from skyloop.transport.local.directory import DIRECTORY_VARIABLE
 
 _AHEAD_NS: Final = 200_000_000
 _ANSWERS_WITHIN_S: Final = 180.0
-OBSERVERS_AT_ONCE: Final = 10  #: connections of one observing process
+OBSERVERS_AT_ONCE: Final = 10  #: number of connections of one observing process
 
 Progress = Callable[[float, str], None]
 
@@ -59,8 +59,8 @@ class Case(NamedTuple):
     """A combination to measure."""
 
     vehicles: int
-    observers: int = 0  #: of the feedback and video of the first vehicle
-    network: str = ""  #: the host's address on the fabric; empty: the local transport
+    observers: int = 0  #: observers of the first vehicle's feedback and video
+    network: str = ""  #: the host's address on the fabric; empty for the local transport
     busy_s: float = 0.0  #: processor time of each vehicle's driver for a command [s]
 
     @property
@@ -75,13 +75,13 @@ class CaseResult(msgspec.Struct, frozen=True):
 
     vehicles: int
     observers: int
-    network: bool  #: over the fabric, instead of the local transport
+    network: bool  #: whether over the fabric instead of the local transport
     channels: dict[str, Summary]
-    shares: dict[str, float]  #: of the samples of each channel that arrived
+    shares: dict[str, float]  #: fraction of each channel's samples that arrived
     cpu: dict[str, float]  #: cores in use by host, pilot and observers
     vehicle_mb: float  #: memory of the host for each vehicle, beyond that of a host with one
     threads: dict[str, int]
-    opened_s: float  #: the pilot took to connect to all
+    opened_s: float  #: time the pilot took to connect to all
     busy_s: float = 0.0  #: processor time of each vehicle's driver for a command [s]
 
 
@@ -112,8 +112,8 @@ def measure(
     Args:
         seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share done, 0 to 1, and the next step.
-        mavlink: Number of emulated MAVLink vehicles in another case; 0: none.
+        progress: Called with the fraction done, 0 to 1, and the next step.
+        mavlink: Number of emulated MAVLink vehicles in another case; 0 for none.
     """
     machine, results = Machine.here(), []
     count = len(cases) + bool(mavlink)
@@ -200,7 +200,7 @@ class _BusyVehicle(BenchVehicle):
 
 
 class _Recorder:
-    """Keeps arrivals as numbers: a hundred thousand tuples would keep Python's collector busy for 60 ms."""
+    """Stores arrivals as numbers, because a hundred thousand tuples keep Python's collector busy for 60 ms."""
 
     def __init__(self) -> None:
         self._stamps: dict[str, array[int]] = {channel: array("q") for channel in CHANNELS}
@@ -281,7 +281,7 @@ def _show(vehicle: BenchVehicle, turn: Turn, begin_ns: int) -> None:
 def fly_all(pipe: Pipe, case: Case) -> None:
     """Run the pilot's process: one program flies all, with a command for each at the same moment."""
     recorder = _Recorder()
-    if case.network:  # in another directory: proxies found on this host would not be searched on the network
+    if case.network:  # in another directory, because proxies found on this host are not looked for on the network
         os.environ[DIRECTORY_VARIABLE] = f"/tmp/skyloop-{os.getpid()}-nobody"
     opening_s = time.monotonic()
     with ExitStack() as stack:

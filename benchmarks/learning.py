@@ -15,16 +15,16 @@ from skyloop.gym import ReachEnv, ReachVectorEnv
 from skyloop.sim.render import use_one_core
 from skyloop.sim.render.compiled import COMPILER
 
-STEP_S: Final = 0.04  #: simulated, of a step of an environment
+STEP_S: Final = 0.04  #: simulated time of one environment step
 PICTURE_PX: Final = 84
 REAL_TIME_TARGET: Final = 100.0  #: simulated seconds per second of one environment without pictures
-PICTURES_TARGET: Final = 400.0  #: per second, of an environment with many drones
+PICTURES_TARGET: Final = 400.0  #: pictures per second of an environment with many drones
 
 Progress = Callable[[float], None]
 
 
 class Case(NamedTuple):
-    """An environment: its number of drones, with or without pictures."""
+    """An environment with a number of drones, with or without pictures."""
 
     drones: int
     pictures: bool
@@ -56,7 +56,7 @@ def measure(seconds: float, cases: tuple[Case, ...] = CASES, progress: Progress 
     Args:
         seconds: Approximate total duration [s].
         cases: The environments.
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     machine = Machine.here()
     COMPILER.start().join()

@@ -28,8 +28,8 @@ from skyloop.files import MAX_RESULTS, read_json
 
 TURN_S: Final = 5.0
 RECORDED_PERIOD_S: Final = 1 / 30
-STUCK_AMONG: Final = 8  #: observers, one of which is stopped
-ENCODED: Final = "8 viewers of H.264, one of them stopped"  #: half share one form, the others have one each
+STUCK_AMONG: Final = 8  #: number of observers, one of which is stopped
+ENCODED: Final = "8 viewers of H.264, one of them stopped"  #: half share one format, the others have one each
 _ANSWERS_WITHIN_S: Final = 20.0
 
 ALONE: Final = "nobody else"
@@ -46,18 +46,18 @@ Progress = Callable[[float, str], None]
 
 
 class Case(NamedTuple):
-    """The other applications connected."""
+    """The other applications that are connected."""
 
     name: str
     observers: int = 0
-    stuck: bool = False  #: the last of the observers is stopped
-    encoded: bool = False  #: the observers take H.264
+    stuck: bool = False  #: whether the last of the observers is stopped
+    encoded: bool = False  #: whether the observers receive H.264
     slow: bool = False
     recorder: bool = False
-    killed: bool = False  #: the recorder, half-way through
-    disk_full: bool = False  #: the recorder's
-    pages: int = 0  #: of a cockpit
-    viewed: bool = False  #: by a viewer subscribed to everything on a Foxglove server, possibly stopped
+    killed: bool = False  #: whether the recorder is killed half-way through
+    disk_full: bool = False  #: whether the recorder's disk is full
+    pages: int = 0  #: number of cockpit pages
+    viewed: bool = False  #: whether a viewer, possibly stopped, subscribes to everything on a Foxglove server
     size: Size = SMALL
     frame_period_s: float = FRAME_PERIOD_S
 
@@ -73,7 +73,7 @@ class CaseResult(msgspec.Struct, frozen=True):
     cpu: dict[str, float]  #: cores in use by each part: 1.0 is one full core
     recorder_lost: dict[str, int] | None = None  #: samples by channel that a recorder dropped or missed
     recorder_stopped: str = ""  #: why a recorder had paused at the end of a turn, such as a full disk
-    pages: int = 0  #: of a cockpit; their channel is ``video, pages``
+    pages: int = 0  #: number of cockpit pages, whose channel is ``video, pages``
 
 
 class Load(msgspec.Struct, frozen=True, tag_field="what", tag="load"):
@@ -97,7 +97,7 @@ def observers_name(number: int, *, stuck: bool = False) -> str:
 
 
 def pages_name(number: int) -> str:
-    """Return the name of a case with pages of a cockpit."""
+    """Return the name of a case with cockpit pages."""
     return f"{number} cockpit page" + ("" if number == 1 else "s")
 
 
@@ -120,7 +120,7 @@ def cases_of(
         stuck: Whether to measure a stopped observer.
         recorder: Whether to measure a recorder, and one that is killed.
         disk_full: Whether to measure a recorder whose disk is full.
-        pages: How many pages of a cockpit to measure; 0 for none.
+        pages: How many cockpit pages to measure; 0 for none.
         encoded: Whether to measure viewers of H.264.
         viewed: Whether to measure a viewer of Foxglove's server, and one that is stopped.
     """
@@ -163,14 +163,14 @@ def measure(
 ) -> Load:
     """Measure each case, in turns.
 
-    Without a disk to fill, its case is omitted, with the reason in the result's ``skipped``.
+    Without a disk to fill, its case is omitted, and the result's ``skipped`` gives the reason.
 
     Args:
         seconds: Duration of each case [s].
         cases: The cases.
         record_to: The folder for the recorder.
         skipped: Cases omitted by the caller, with reasons, for the result.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
@@ -254,7 +254,7 @@ class _Stage:
     """The processes of all cases; a case connects only those it needs."""
 
     def __init__(self, workers: Workers, folder: str, cases: Sequence[Case], folders: Mapping[bool, Path]) -> None:
-        """``folders``: for recordings, False: with room, True: to be filled."""
+        """``folders``: those for recordings, with enough space (False) or a disk to fill (True)."""
         self._workers = workers
         self._proxy = proxy_name(folder)
         self._folders = folders
@@ -320,7 +320,7 @@ class _Stage:
 
 
 def _tell(workers: Sequence[Worker], words: Sequence[str]) -> None:
-    """Send these words to all at once, one by one, then collect their answers."""
+    """Send all workers these messages, one after another, and collect the answers."""
     for worker, word in zip(workers, cycle(words), strict=False):
         worker.pipe.send(word)
     for worker in workers:
@@ -340,7 +340,7 @@ def _stopped(workers: Sequence[Worker]) -> Iterator[None]:
 
 
 def _used_s(parts: Mapping[str, Sequence[int]]) -> dict[str, float]:
-    """Return the processor time so far of each part's processes, without parts that have none."""
+    """Return the processor time of each part's processes so far, without parts that have none."""
     return {part: sum(map(cpu_time_s, pids)) for part, pids in parts.items() if pids}
 
 
@@ -358,7 +358,7 @@ def load(path: Path) -> Load:
     """Read ``load.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Load, "the results of benchmarks.load", MAX_RESULTS)
 

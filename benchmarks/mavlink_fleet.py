@@ -34,12 +34,12 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.emulation.emulator import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 
-RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands
+RATE_HZ: Final = 10.0  #: rate of the vehicles' feedback, and of repeated commands
 EMULATED_HZ: Final = 20.0  #: rate of an emulated autopilot
 WORLD: Final = 200  #: vehicles of one emulating process, which share a world
 LEG_M: Final = 1.0  #: distance of the formation to each side of its start
-PERIOD_S: Final = 12.0  #: there and back
-TICKS_HZ: Final = 10.0  #: of the formation's set-points
+PERIOD_S: Final = 12.0  #: duration of a flight there and back
+TICKS_HZ: Final = 10.0  #: rate of the formation's set-points
 _TAKE_OFF_S: Final = 40.0
 _ANSWERS_WITHIN_S: Final = 180.0
 _UP_WITHIN_S: Final = 60.0
@@ -50,13 +50,13 @@ class MavlinkResult(msgspec.Struct, frozen=True):
     """The result. A vehicle's link counts as lost if it broke during the measurement or was down at its end."""
 
     vehicles: int
-    flown: int  #: in the air in formation at the start
+    flown: int  #: vehicles flying in formation at the start
     up: int  #: links up at the start
-    lost: int  #: of these
-    share: float  #: of the states that the vehicles report, :data:`RATE_HZ` a second each, that the program received
+    lost: int  #: links lost, of these
+    share: float  #: fraction of the states reported, :data:`RATE_HZ` a second per vehicle, that the program received
     age_median_ms: float  #: from a state's capture to its arrival in the program
     age_p99_ms: float
-    error_p99_m: float | None  #: of a vehicle from its place in the formation, at each tick; None: none flew
+    error_p99_m: float | None  #: distance of a vehicle from its place in the formation, at each tick; None if none flew
     error_most_m: float | None
     failed: dict[str, str]  #: vehicles that left their formation, and why
     cpu: dict[str, float]  #: cores in use by host, pilot and emulators
@@ -67,7 +67,7 @@ class Flown(NamedTuple):
 
     states: int
     ages_ns: Sequence[int]
-    errors_m: Sequence[float]  #: of each vehicle at each tick
+    errors_m: Sequence[float]  #: error of each vehicle at each tick
     failed: Mapping[str, str]
 
 
@@ -82,7 +82,7 @@ def measure(vehicles: int, seconds: float) -> MavlinkResult:
         NoAnswerError: A process did not start, or ended.
     """
     with Workers() as workers:
-        ports = Ports.several(Kind.ARDUCOPTER, 0, vehicles)  # all at once: separate processes would get the same ones
+        ports = Ports.several(Kind.ARDUCOPTER, 0, vehicles)  # at once: separate processes would get the same ports
         emulators = [workers.start(emulate, ports[first : first + WORLD]) for first in range(0, vehicles, WORLD)]
         addresses = [emulator.answer(_ANSWERS_WITHIN_S) for emulator in emulators]
         host = workers.start(serve, [address for each in addresses for address in each])
@@ -120,7 +120,7 @@ def _used_s(parts: Mapping[str, Sequence[Worker]]) -> dict[str, float]:
 
 
 def emulate(pipe: Pipe, ports: Sequence[Ports]) -> None:
-    """Run an emulated ArduCopter on each of some ports, all in one world."""
+    """Run an emulated ArduCopter on each of these ports, all in one world."""
     world = SimHost(with_multirotors(SimOptions(world="empty"), rate_hz=EMULATED_HZ), len(ports))
     loop = Loop("emulators")
     with ExitStack() as stack:
@@ -197,13 +197,13 @@ class _Ages:
 class _Formation:
     """Every second vehicle, all in one formation that moves from one side to the other and back.
 
-    Each vehicle's place is its hover after take-off, moved with the formation: each has its own world axes, which begin
-    at its start, and vehicles of different worlds know nothing of each other.
+    Each vehicle's place is where it hovered after take-off, moved with the formation, because each has its own world
+    axes, which begin at its start, and vehicles of different worlds know nothing about each other.
     """
 
     def __init__(self, drones: Swarm) -> None:
         self.drones = drones
-        self.errors_m: list[float] = []  #: of each vehicle at each tick
+        self.errors_m: list[float] = []  #: error of each vehicle at each tick
 
     def take_off(self) -> None:
         """Take off, and wait until all hover; set aside those that don't."""
@@ -256,7 +256,7 @@ def fly(pipe: Pipe, count: int, seconds: float) -> None:
         stack.enter_context(suppress(SkyloopError))  # the swarm reports its failed drones again at the end
         formation = _Formation(stack.enter_context(Swarm(drones)))
         gc.collect()
-        gc.freeze()  # once it is connected, as docs/host.md advises
+        gc.freeze()  # once connected, as docs/host.md advises
         formation.take_off()
         pipe.send(len(formation.drones.active))
         begin_ns = pipe.recv()

@@ -1,8 +1,8 @@
 """Render a moving camera's view for all senders of video; an image depends only on its stamp. Needs only NumPy.
 
 A window of a large picture, with detail at all scales and some noise, moves like a drone that looks around. Each
-picture carries its stamp in its upper left corner, in a form that survives any encoder, because some transports keep
-none.
+picture carries its stamp in its upper left corner, in a form that survives any encoder, because some transports drop
+stamps.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import numpy as np
 from benchmarks.measuring.contract import Image
 from benchmarks.measuring.schedule import Size
 
-STAMP_NS: Final = 125_000  #: the stamps' step
+STAMP_NS: Final = 125_000  #: resolution of the stamps
 _BITS: Final = 24
 _COLUMNS: Final = 12
-_CELL: Final = 1 / 40  # of the width
+_CELL: Final = 1 / 40  # size of one of the stamp's cells, as a fraction of the width
 _DARK, _LIGHT = 40, 215
 _PERIOD_S: Final = 6.0
 _NOISE: Final = 2.0
@@ -66,7 +66,7 @@ class MovingScene:
 
 
 def stamp_in(image: Image, now_ns: int) -> int:
-    """Return the stamp of a picture, however damaged or small, within the last half hour [ns]."""
+    """Return the stamp of a picture, however damaged or small, from the last half hour [ns]."""
     cell = image.shape[1] * _CELL
     stamp = 0
     for bit in range(_BITS):

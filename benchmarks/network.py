@@ -26,9 +26,9 @@ from skyloop.files import MAX_RESULTS, read_json
 LOSSES: Final = (0.0, 0.01, 0.1, 0.3)
 DATAGRAMS: Final = "datagrams and TCP"
 TCP: Final = "TCP only"
-#: The vehicle's side of each connection, at the first end of the path. Without keys an address means UDP beside TCP.
+#: The vehicle's side of each connection, at the first end of the path. Without keys, an address means UDP and TCP.
 WAYS: Final = {DATAGRAMS: "{address}:7447", TCP: "tcp/{address}:7447"}
-#: Besides the loss: a wireless network of a few walls.
+#: Other effects than loss, as of a wireless network through a few walls.
 PATH: Final = Impairments(delay_s=0.005, jitter_s=0.001, reorder=0.01, reorder_s=0.005)
 TURN_S: Final = 10.0
 _SEED: Final = 6
@@ -44,7 +44,7 @@ class Channel(msgspec.Struct, frozen=True):
     """The samples of one channel sent and received."""
 
     sent: int
-    arrived: int  #: commands: executed
+    arrived: int  #: number that arrived or, for commands, that were executed
     age: Summary | None  #: None if nothing arrived
 
     @property
@@ -68,7 +68,7 @@ class Wire(msgspec.Struct, frozen=True):
     command: float
     feedback: float
     frame: float
-    frame_back: float  #: to the proxy, the viewer's acknowledgement
+    frame_back: float  #: the viewer's acknowledgement to the proxy
 
 
 class Network(msgspec.Struct, frozen=True, tag_field="what", tag="network"):
@@ -79,7 +79,7 @@ class Network(msgspec.Struct, frozen=True, tag_field="what", tag="network"):
     path: str
     cases: list[CaseResult]
     wire: Wire | None = None
-    megabytes_per_s: float = 0.0  #: capacity of the path's own process, with one TCP connection
+    megabytes_per_s: float = 0.0  #: capacity of the path's own process with one TCP connection
 
     def case(self, way: str, loss: float) -> CaseResult | None:
         """Return a case's result; None if it was not measured."""
@@ -96,9 +96,9 @@ def measure(
 
     Args:
         seconds: Duration of each case [s].
-        losses: Shares of packets lost.
+        losses: Fractions of packets lost.
         ways: The ways to connect, by name.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
         UnsupportedError: No hosts can be created here.
@@ -229,7 +229,7 @@ class _Tally:
 
 
 def describe(path: Impairments) -> str:
-    """Return the path in words."""
+    """Describe the path."""
     return (
         f"{path.delay_s * 1e3:g} ms each way and up to {path.jitter_s * 1e3:g} ms more; "
         f"{path.reorder:.0%} held back for {path.reorder_s * 1e3:g} ms"
@@ -239,8 +239,8 @@ def describe(path: Impairments) -> str:
 def load(path: File) -> Network:
     """Read ``network.json``.
 
-    FileFormatError: It is not such a file.
-        FileFormatError: It is anything else.
+    Raises:
+        FileFormatError: The file has another format.
     """
     return read_json(path, Network, "the results of benchmarks.network", MAX_RESULTS)
 

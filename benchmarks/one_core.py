@@ -8,8 +8,8 @@ from benchmarks.measuring.workers import Pipe
 
 
 def codecs_on_one_core(pipe: Pipe, seconds: float) -> None:
-    """Send the share of the work done, and finally the results."""
-    if hasattr(os, "sched_setaffinity"):  # elsewhere the libraries' threads are counted too
+    """Send the fraction of the work done, and finally the results."""
+    if hasattr(os, "sched_setaffinity"):  # on other systems, the libraries' threads are counted too
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     from benchmarks.codecs import measure_here
 

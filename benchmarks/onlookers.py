@@ -21,7 +21,7 @@ from skyloop.errors import LinkError, MissingExtraError
 if TYPE_CHECKING:
     from skyloop.cockpit.testing import Pages
 
-#: The message that makes an observer receive H.264: all of one form, or one form each.
+#: The message that makes an observer receive H.264, all in one format or each in its own.
 SHARED: Final = "h264"
 OWN: Final = "h264, own"
 _KBIT_S: Final = 1000
@@ -53,7 +53,7 @@ def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:
         pipe: To the measuring process.
         proxy: The proxy's name.
         file: Where to record.
-        fill: Whether to fill the disk to its last byte; the file is deleted afterwards.
+        fill: Whether to fill the disk to the last byte; the file is deleted afterwards.
     """
     from skyloop import recording
     from skyloop.recording.options import Options
@@ -73,7 +73,7 @@ def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:
 
 
 def show(pipe: Pipe, proxy: str, number: int) -> None:
-    """Run a cockpit; send its process id once ``number`` pages are open, and finally the age of their frames."""
+    """Run a cockpit; send its process id once ``number`` pages are open, and finally the ages of their frames."""
     from skyloop.cockpit.child import CockpitProcess
     from skyloop.cockpit.testing import Pages
 
@@ -150,7 +150,7 @@ def recorder_problem() -> str:
         from skyloop.recording.recorder import check_installed
 
         check_installed()
-    except ImportError as error:  # a part that is not installed is one too
+    except ImportError as error:  # also if a part is not installed
         return str(error)
     return ""
 

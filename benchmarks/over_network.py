@@ -56,8 +56,8 @@ class Vehicle(ours.Vehicle):
         name, settings = settings_of(address, serves=True)
         return name, FabricServer(name, settings)
 
-    def frame(self, sent_ns: int, image: Image) -> None:  # noqa: ARG002  (noise is no picture, and no JPEG is longer)
-        """Send the picture instead of noise, which makes the longest JPEGs."""
+    def frame(self, sent_ns: int, image: Image) -> None:  # noqa: ARG002  (noise would make the longest JPEGs)
+        """Send the picture instead of noise, which would make the longest JPEGs."""
         super().frame(sent_ns, scenery())
 
 
@@ -70,7 +70,7 @@ class Application(ours.Application):
         return connect(address)
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:
-        """Send a command; one that can't be sent counts as lost."""
+        """Send a command; if that fails, it counts as lost."""
         try:
             super().command(sent_ns, setpoint)
         except SkyloopError:  # not sent, so not executed: counted as lost
@@ -78,7 +78,7 @@ class Application(ours.Application):
 
 
 class Pilot(Application):
-    """A pilot who flies without the video."""
+    """A pilot who flies without video."""
 
     looks = False
 
@@ -87,8 +87,8 @@ def connect(address: str, access: Access = "pilot", *, lease_s: float = LEASE_S)
     """Connect to a drone over the network, retrying for a while on a busy machine.
 
     Raises:
-        LinkError: It did not answer.
-        UnknownNameError: It was not found.
+        LinkError: The drone did not answer.
+        UnknownNameError: The drone was not found.
     """
     name, settings = settings_of(address, serves=False)
     settings = replace(settings, lease_s=lease_s)
@@ -105,7 +105,7 @@ def connect(address: str, access: Access = "pilot", *, lease_s: float = LEASE_S)
 
 @cache
 def scenery() -> Image:
-    """Return a picture as detailed as a camera's in a room: as a JPEG of quality 80 it has about 14 kB."""
+    """Return a picture as detailed as a camera's in a room: at JPEG quality 80 it has about 14 kB."""
     rng = np.random.default_rng(1)
     coarse = rng.integers(30, 225, (SMALL.height // 20, SMALL.width // 20, 3))
     image = np.kron(coarse, np.ones((20, 20, 1))) + rng.normal(0.0, 4.0, (SMALL.height, SMALL.width, 3))

@@ -37,7 +37,7 @@ FORMS: Final[Mapping[str, VideoOptions | None]] = MappingProxyType(
 
 
 def address(form: str, place: str) -> str:
-    """Return the address for both ends: of the proxy on the network, and the form of the video."""
+    """Return the address for both ends: the proxy's on the network, and the form of the video."""
     return f"{form}|{over_network.address('alpha', place)}"
 
 

@@ -87,7 +87,7 @@ class SpeedEstimate:
     """A first-order model of the recorded drone's speed estimate."""
 
     lag_s: float  #: time constant [s]
-    #: Factor of the estimate. In the recordings, a pitch that reads too small by as much looks the same.
+    #: Factor of the estimate. In the recordings, a pitch that reads too low by the same factor looks the same.
     scale: float
 
     def of(self, response: Response) -> Floats:

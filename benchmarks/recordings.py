@@ -1,7 +1,7 @@
 """Measure the time to open, inspect, seek and export a recording of ten minutes.
 
-The video is H.264 of a simulated flight, 640×360, 30 pictures a second, a key picture each second. Half a minute of it
-is drawn and encoded; the recording repeats that with the times of a whole flight.
+The video is H.264 of a simulated flight, 640×360, with 30 pictures and one key picture a second. Half a minute of it is
+drawn and encoded; the recording repeats that with the times of a whole flight.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from skyloop.vehicles.replay.source import ReplaySource
 FPS: Final = 30
 FEEDBACK_HZ: Final = 50
 COMMAND_HZ: Final = 32
-DRAWN_S: Final = 30  #: of video drawn
+DRAWN_S: Final = 30  #: duration of the drawn video
 BITRATE_KBPS: Final = 2000
-EXPORT_TARGET_S: Final = 5.0  #: for a flight of ten minutes
+EXPORT_TARGET_S: Final = 5.0  #: target for a flight of ten minutes
 DRONE: Final = "alpha"
 CAMERA: Final = "front"
 
@@ -77,7 +77,7 @@ class Recordings(msgspec.Struct, frozen=True):
     machine: Machine
     seconds: float  #: duration of the recorded flight
     frames: int
-    bytes: int  #: of the file
+    bytes: int  #: size of the file
     rows: list[RecordingRow]
 
 
@@ -87,7 +87,7 @@ def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda 
     Args:
         seconds: Duration of the recorded flight [s].
         encode: Whether to also measure the export that decodes and encodes each picture.
-        progress: Called with the share done, 0 to 1.
+        progress: Called with the fraction done, 0 to 1.
     """
     machine = Machine.here()
     with tempfile.TemporaryDirectory() as folder:
@@ -135,18 +135,18 @@ def drawn(seconds: float) -> list[Encoded]:
     for _ in range(max(FPS, round(seconds) * FPS)):
         flight.draw(0)
         unit = encoder.encode(flight.picture[: flight.picture.shape[1] * H264_360P.height // H264_360P.width])
-        assert unit is not None  # without delay, each picture yields one at once
+        assert unit is not None  # the encoder has no delay, so each picture yields one at once
         units.append(unit)
     return units
 
 
 def write_recording(path: Path, seconds: float, units: Sequence[Encoded]) -> None:
-    """Write a flight like the recorder: its messages, and a chunk every half second.
+    """Write a flight as the recorder does: the same messages, and a chunk every half second.
 
     Args:
         path: The file.
         seconds: Duration of the flight [s].
-        units: Its pictures, repeated as needed. The first is a key picture.
+        units: The encoded pictures, repeated as needed. The first is a key picture.
     """
     clock = ClockPair(NS_PER_S, 1_760_000_000 * NS_PER_S, 1)
     translator = Translator(DRONE, _CAPABILITIES, clock)

@@ -1,6 +1,6 @@
 """Measure the delay that the bridge to ROS 2 adds, in one run with Skyloop's own: ``python -m benchmarks.ros``.
 
-Four processes: a simulated drone's proxy, the bridge, a program of rclpy that flies by ``cmd_vel`` and receives images,
+Four processes: a simulated drone's proxy, the bridge, an rclpy program that flies by ``cmd_vel`` and receives images,
 and this one, which receives the same images and the echoes of the commands like any Skyloop client.
 """
 
@@ -29,8 +29,8 @@ from skyloop.messages import Applied, Velocity
 from skyloop.vehicles.ros2.node import LOOPBACK_PROFILE, PROFILES_VARIABLE
 
 ADDRESS: Final = "sim://?world=room&seed=0"
-PERIOD_S: Final = 1 / 32  #: of velocities, as in ``ros_probe.py``
-STEP: Final = 1e-4  #: of their yaw rates, likewise [rad/s]
+PERIOD_S: Final = 1 / 32  #: period of the velocities, as in ``ros_probe.py``
+STEP: Final = 1e-4  #: step between their yaw rates, as there [rad/s]
 IMAGE_PERIOD_S: Final = 1 / 30
 PROBE: Final = Path(__file__).parent / "ros_probe.py"
 STARTS_WITHIN_S: Final = 30.0
@@ -39,8 +39,8 @@ STARTS_WITHIN_S: Final = 30.0
 class RosDelays(msgspec.Struct, frozen=True):
     """A whole run, as in ``ros.json``.
 
-    ``command``: Twist published to applied; ``command_own``: of that, sent by the bridge to applied, as for a Skyloop
-    application. ``image``: captured to the callback of rclpy; ``image_own``: to that of Skyloop.
+    ``command``: from the published Twist until it is applied; ``command_own``: the part from the bridge on, as for a
+    Skyloop application. ``image``: from capture to the rclpy callback; ``image_own``: to the Skyloop callback.
     """
 
     machine: Machine
@@ -60,8 +60,8 @@ def measure(
 
     Args:
         seconds: The duration [s].
-        ros_python: An interpreter with rclpy and Skyloop; None: that of ``SKYLOOP_ROS_PYTHON``, or this one.
-        progress: Called with the share done, 0 to 1, and the next step.
+        ros_python: An interpreter with rclpy and Skyloop; None for that in ``SKYLOOP_ROS_PYTHON``, or this one.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
         NoAnswerError: A process did not start, or failed.
@@ -83,7 +83,7 @@ def measure(
                 probe = [python, str(PROBE), "/bench", str(seconds)]
                 done = subprocess.run(probe, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise NoAnswerError(f"the program of rclpy failed: {done.stderr[-500:]}")
+        raise NoAnswerError(f"the rclpy program failed: {done.stderr[-500:]}")
     told = json.loads(done.stdout.splitlines()[-1])
     return _judged(machine, seconds, told["published_ns"], told["image_ages_ns"], echoes, ages_ns)
 
@@ -110,13 +110,13 @@ def _environment(folder: Path) -> dict[str, str]:
 
 
 def _watch(drone: Drone) -> tuple[dict[int, Applied], list[int]]:
-    """Return the echoes, by the number of their velocity, and the ages of frames [ns], both filled later."""
+    """Return the echoes, by the number of their velocity, and the ages of frames [ns]; both are filled later."""
     echoes: dict[int, Applied] = {}
     ages_ns: list[int] = []
 
     def on_command(echo: Applied) -> None:
         if isinstance(echo.asked, Velocity):
-            echoes.setdefault(round(echo.asked.yaw_rate / STEP), echo)  # the first: others are repeats
+            echoes.setdefault(round(echo.asked.yaw_rate / STEP), echo)  # the first one, because the others are repeats
 
     drone.on_command(on_command)
     drone.on_frame(lambda frame: ages_ns.append(drone.now_ns - frame.captured_ns))
@@ -147,7 +147,7 @@ def _judged(
 
 @contextmanager
 def _running(command: list[str], environment: dict[str, str], ready: str) -> Iterator[None]:
-    """Run a process, from its line that begins with ``ready``."""
+    """Run a process for the block, which begins when it prints a line that starts with ``ready``."""
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
         try:

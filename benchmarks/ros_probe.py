@@ -2,8 +2,8 @@
 
     python ros_probe.py /alpha SECONDS
 
-Takes off, flies for this time, lands. Prints as JSON when each velocity was published, by its yaw rate, and the age of
-each image when its callback ran, by its stamp [ns].
+Takes off, flies for this time and lands. Prints as JSON when each velocity was published, by its yaw rate, and how old
+each image was when its callback ran, by its stamp [ns].
 """
 
 import json
@@ -44,7 +44,7 @@ def main() -> None:
     call("takeoff")
     images = node.create_subscription(Image, "front/image_raw", on_image, qos_profile_sensor_data)
     end = time.monotonic() + 10.0
-    while len(ages_ns) < 30:  # found, and warm
+    while len(ages_ns) < 30:  # until the camera is found and images flow
         if time.monotonic() > end:
             raise TimeoutError(f"{len(ages_ns)} images arrived within 10 s")
         rclpy.spin_once(node, timeout_sec=0.1)

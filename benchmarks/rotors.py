@@ -1,7 +1,7 @@
 """Compare the responses of the rotor-level vehicles with published ones of real vehicles.
 
 ``python -m benchmarks.rotors`` measures in the simulator and prints the figures of docs/rotors.md. The results do not
-depend on the machine's speed, and are the same everywhere.
+depend on the machine.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _UP_S, _SETTLED_S, _SHOWN_S, _COAST_M_S = 5.0, 3.0, 1.2, 1.0
 
 
 class Identified(NamedTuple):
-    """A real Crazyflie identified from flights in drone-models 0.1.0 (MIT): its name gives the motors and propellers.
+    """A real Crazyflie, identified from flights in drone-models 0.1.0 (MIT); its name gives motors and propellers.
 
     Attitude: angle'' = stiffness · angle + damping · angle' + gain · command.
     """
@@ -44,7 +44,7 @@ class Identified(NamedTuple):
     damping: float
     gain: float
     thrust_s: float  #: time constant of the thrust
-    drag_n_s_m: float  #: lateral
+    drag_n_s_m: float  #: lateral drag
 
 
 IDENTIFIED: Final = (
@@ -55,7 +55,7 @@ IDENTIFIED: Final = (
 
 
 class Response(NamedTuple):
-    """The times at which a response reaches shares of its final value, and its overshoot."""
+    """The times at which a response reaches fractions of its final value, and its overshoot."""
 
     tenth_s: float
     half_s: float
@@ -83,7 +83,7 @@ def response(values: Sequence[float], end: float, period_s: float) -> Response:
 
 
 def attitude_step(vehicle: VehicleParameters) -> Response:
-    """Command a roll from hover, and follow it."""
+    """Command a roll from hover, and return the response."""
     simulation = hovering(vehicle)
     simulation.command(0, Attitude(roll=STEP_RAD))
     angles = []
@@ -94,7 +94,7 @@ def attitude_step(vehicle: VehicleParameters) -> Response:
 
 
 def identified_step(one: Identified) -> Response:
-    """Return the response of an identified vehicle, as a share of its final value: its gain is not 1."""
+    """Return the response of an identified vehicle as a fraction of its final value, because its gain is not 1."""
     angle = rate = 0.0
     angles = []
     fine_s = PLANT_STEP_S / 10
@@ -107,7 +107,7 @@ def identified_step(one: Identified) -> Response:
 
 
 def thrust_lag_s(vehicle: VehicleParameters) -> float:
-    """Return the time for 63 % of a step of the thrust by a tenth, with the body fixed as on a test stand."""
+    """Return the time for 63 % of a thrust step of a tenth, with the body fixed as on a test stand."""
     constants, rotors = constants_of(vehicle), rotors_of(vehicle)
     still, untouched = (0.0, 0.0, 0.0, 0.0, 0.0, 100.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     speed = math.sqrt(vehicle.mass_kg * GRAVITY_M_S2 / 4 / rotors.thrust_n_s2)
@@ -122,7 +122,7 @@ def thrust_lag_s(vehicle: VehicleParameters) -> float:
 
 
 def drag_per_s(vehicle: VehicleParameters) -> float:
-    """Return the share of its speed that a level vehicle loses in a second, at 1 m/s."""
+    """Return the fraction of its speed that a level vehicle loses per second, at 1 m/s."""
     simulation = hovering(vehicle)
     simulation.command(0, Attitude(pitch=0.1))
     while simulation.truth(0).velocity_m_s[0] < 1.2 * _COAST_M_S:
@@ -136,7 +136,7 @@ def drag_per_s(vehicle: VehicleParameters) -> float:
 
 
 def hovering(vehicle: VehicleParameters) -> Simulation:
-    """Return a vehicle with ideal sensors, hovering."""
+    """Return a hovering vehicle with ideal sensors."""
     simulation = Simulation(_HALL, parameters=with_ideal_sensors(vehicle), limits=_LIMITS)
     simulation.command(0, Takeoff())
     simulation.step(round(_UP_S / STEP_S))
@@ -147,7 +147,7 @@ def hovering(vehicle: VehicleParameters) -> Simulation:
 
 
 class Hover(NamedTuple):
-    """The requirements of hovering."""
+    """The figures of hovering."""
 
     rotor_speed_rad_s: float
     power_w: float

@@ -37,7 +37,7 @@ PARTS: Final = ("proxies", "pilot", "observers", "router")
 LEAST_SHARE: Final = 0.99
 MOST_P99: Final = 5.0
 MOST_CORES: Final = 0.9
-OBSERVED: Final = 10  #: observers in the cases that give the costs of one
+OBSERVED: Final = 10  #: observers in the cases that give the unit costs
 _AT_ONCE: Final = 10  # processes that connect at the same moment
 _AHEAD_NS: Final = 200_000_000
 _ANSWERS_WITHIN_S: Final = 120.0
@@ -53,7 +53,7 @@ class Case(NamedTuple):
 
     proxies: int
     observers: int
-    video: bool = True  #: whether observers get it too
+    video: bool = True  #: whether observers get video too
     router: bool = False  #: whether the observers are on another segment, behind a router
 
     @property
@@ -74,10 +74,10 @@ class CaseResult(msgspec.Struct, frozen=True):
     video: bool
     router: bool
     channels: dict[str, Summary]
-    shares: dict[str, float]  #: of the samples of each channel that arrived
+    shares: dict[str, float]  #: fraction of each channel's samples that arrived
     cpu: dict[str, float]  #: cores in use by each part: 1.0 is one full core
     memory_mb: dict[str, float]  #: unshared memory of one process of each part
-    opened_s: float  #: the pilot took to connect to all proxies in sequence
+    opened_s: float  #: time the pilot took to connect to all proxies in sequence
 
 
 class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
@@ -93,7 +93,7 @@ class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
         """Return a series of cases.
 
         Args:
-            many: ``"proxies"``: growing numbers of them, each with its observer; ``"observers"``: of one proxy.
+            many: ``"proxies"``: growing numbers of proxies, each with an observer; ``"observers"``: of one proxy.
         """
         found = [case for case in self.cases if case.video and not case.router and case.observers]
         wanted = [
@@ -109,7 +109,7 @@ class Scale(msgspec.Struct, frozen=True, tag_field="what", tag="scale"):
 
 
 def bends(series: Sequence[CaseResult], cores: int) -> tuple[CaseResult, str] | None:
-    """Return the first overloaded case of a series, and why; None if none is.
+    """Return the first overloaded case of a series, and why; None if there is none.
 
     Overloaded means that too few samples arrive, that the 99th percentile of a delay is too many times the first
     case's, or that too many cores are in use.
@@ -128,7 +128,7 @@ def bends(series: Sequence[CaseResult], cores: int) -> tuple[CaseResult, str] | 
     return None
 
 
-#: The cases that give the costs of one: see :mod:`benchmarks.units`.
+#: The cases that give the unit costs: see :mod:`benchmarks.units`.
 UNIT_CASES: Final = (
     Case(1, 0, video=False),
     Case(1, OBSERVED, video=False),
@@ -152,7 +152,7 @@ def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _
     Args:
         seconds: Duration of each case [s].
         cases: The cases.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     skipped: dict[str, str] = {}
@@ -246,7 +246,7 @@ class _Stage:
 
 
 class _Places(NamedTuple):
-    """The places of the parts, if they are not all on this host's loopback."""
+    """Where the parts run, if not all of them on this host's loopback."""
 
     router: tuple[str, ...] = ()  #: addresses of a router, on the proxies' segment and the observers'
     prefixes: Mapping[str, Sequence[str]] = MappingProxyType({})
@@ -317,7 +317,7 @@ def fly_all(pipe: Pipe, addresses: Sequence[str]) -> None:
                 for application in applications:
                     application.command(time.monotonic_ns(), setpoint)
             time.sleep(SETTLE_S)
-            pipe.send(recorder.arrivals)  # before they close, which takes long on a heavily overloaded machine
+            pipe.send(recorder.arrivals)  # before closing, which takes long on a heavily overloaded machine
 
 
 def observe(pipe: Pipe, address: str, video: bool) -> None:
@@ -336,7 +336,7 @@ def observe(pipe: Pipe, address: str, video: bool) -> None:
 
 
 def route(pipe: Pipe, places: Sequence[str]) -> None:
-    """Run a router on all segments, until the end."""
+    """Run a router on all segments until the end."""
     session = acquire(FabricSettings(listen=tuple(places), multicast=False), Part.ROUTER)
     pipe.send("ready")
     try:
@@ -360,7 +360,7 @@ def load(path: Path) -> Scale:
     """Read ``scale.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Scale, "the results of benchmarks.scale", MAX_RESULTS)
 

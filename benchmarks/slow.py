@@ -18,7 +18,7 @@ SLOW_VIDEO: Final = f"{VIDEO}, slow processor"
 
 
 class Application(ours.Application):
-    """The pilot's end, with the slow processor."""
+    """The pilot's end with the slow processor."""
 
     def __init__(self, address: str, received: Received) -> None:
         super().__init__(address, received)
@@ -27,7 +27,7 @@ class Application(ours.Application):
             received(SLOW_VIDEO, frame.captured_ns)
             until = time.monotonic() + SLOW_S
             mean = np.zeros(frame.shape, np.float32)
-            while time.monotonic() < until:  # like image processing: long work on arrays
+            while time.monotonic() < until:  # like image processing, which works on arrays for long
                 mean += 0.1 * (frame - mean)
 
         self._drone.on_frame(slow, camera=CAMERA)

@@ -24,7 +24,7 @@ from skyloop.files import MAX_RESULTS, read_json
 from skyloop.network.config import DEFAULT_PORT, free_port
 
 STOPPED_S: Final = 1.2  #: longer than ``failsafe.hover_after_s``, and shorter than ``failsafe.land_after_s``
-#: A step of the ladder is expected within this time of its cause; 0.5 s of it are the rule.
+#: A step of the ladder is expected within this time after its cause, including the rule's own 0.5 s.
 WITHIN_S: Final = 2.0
 SEED: Final = 4
 _STARTS_WITHIN_S: Final = 60.0
@@ -35,7 +35,7 @@ Progress = Callable[[float, str], None]
 
 
 class Expected(NamedTuple):
-    """A user stopped at this time, so this drone must fail safe."""
+    """A drone that must fail safe, because its user stopped at this time."""
 
     drone: str
     since_ns: int
@@ -46,8 +46,8 @@ class Verdict(msgspec.Struct, frozen=True):
 
     expected: int
     missed: int
-    needless: int  #: taken although no user had stopped
-    delay: Spread | None  #: from the user's last moment to the step; None if there was none
+    needless: int  #: failsafes taken although no user had stopped
+    delay: Spread | None  #: from the user's last moment to the step; None if there was no step
 
 
 class Swarm(msgspec.Struct, frozen=True, tag_field="what", tag="swarm"):
@@ -58,12 +58,12 @@ class Swarm(msgspec.Struct, frozen=True, tag_field="what", tag="swarm"):
     drones: int
     users: int
     observers: int
-    hosts: bool  #: whether they were on separate hosts, or all on the loopback of one
-    command: Spread  #: from sending to applying
-    feedback: Spread  #: from the capture to the user
+    hosts: bool  #: whether the parts were on separate hosts, or all on the loopback of one
+    command: Spread  #: delay from sending to applying
+    feedback: Spread  #: delay from the capture to the user
     feedback_at_observers: Spread | None
     commands_per_s: float  #: executed by each drone, including the time without its user
-    frames_per_s: float  #: at an observer, of each drone; 0 without observers
+    frames_per_s: float  #: received from each drone by an observer; 0 without observers
     failsafe: Verdict
     cpu: dict[str, float]  #: cores in use by each part
 
@@ -98,14 +98,14 @@ def measure(
 ) -> Swarm:
     """Make processes share the drones and fly them.
 
-    Each process is stopped once meanwhile, and finally the first one is killed. With root each part has its own host.
+    Each process is stopped once, and finally the first one is killed. With root, each part has its own host.
 
     Args:
         seconds: Duration [s].
         drones: Number of drones.
         users: Number of processes that fly them.
         observers: Number of processes that watch all of them.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
     """
     machine = Machine.here()
     with _stage(drones, users, observers) as stage:
@@ -134,7 +134,7 @@ class Flight(NamedTuple):
 
     commands_ns: list[int]
     feedback_ns: list[int]
-    observed_ns: list[int]  #: feedback at the observers
+    observed_ns: list[int]  #: ages of feedback at the observers
     frames: int  #: at all observers together
     expected: list[Expected]
     steps: list[Step]
@@ -164,7 +164,7 @@ class _Stage:
             worker.answer(_STARTS_WITHIN_S)
 
     def play(self, seconds: float, progress: Progress) -> Flight:
-        """Stop and resume users; finally collect everyone's observations, and kill the first."""
+        """Stop and resume users; finally collect everyone's observations, and kill the first user."""
         users = len(self._users)
         expected: list[Expected] = []
         for worker in (*self._users, *self._observers):
@@ -198,7 +198,7 @@ class _Stage:
         )
 
     def _expect(self, user: int) -> list[Expected]:
-        """Return the expected failsafes of the flying drones: others have no reason to fail safe."""
+        """Return the expected failsafes of the flying drones; drones on the ground have no reason to fail safe."""
         flying = _ask(self._witness, "flying")
         now_ns = time.monotonic_ns()
         return [Expected(drone, now_ns) for drone in self.shares[user] if drone in flying]
@@ -238,7 +238,7 @@ def load(path: Path) -> Swarm:
     """Read ``swarm.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Swarm, "the results of benchmarks.swarm", MAX_RESULTS)
 

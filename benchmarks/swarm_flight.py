@@ -32,8 +32,8 @@ from skyloop.errors import SkyloopError
 from skyloop.extend import Known
 from skyloop.messages import Applied, Event, EventKind, Failsafe, Feedback
 
-LAND_AFTER_S: Final = 5.0  #: the usual value of ``failsafe.land_after_s``
-_HOVER_WITHIN_S: Final = 5.0  # longest wait for the hover
+LAND_AFTER_S: Final = 5.0  #: default of ``failsafe.land_after_s``
+_HOVER_WITHIN_S: Final = 5.0  # maximum wait for the hover
 _LAND_WITHIN_S: Final = 30.0
 
 
@@ -42,18 +42,18 @@ class SwarmFlight:
     """The result of one drone's flight. Delays in s."""
 
     name: str
-    commands: int  #: of this program that were applied
-    command: Distribution | None  #: from sending to the driver
-    feedback: Distribution | None  #: from the proxy's publishing to this program; the last 1024
-    frames: int  #: passed to its controller
-    refused: int  #: commands
+    commands: int  #: commands of this program that were applied
+    command: Distribution | None  #: delay from sending to the driver
+    feedback: Distribution | None  #: delay from the proxy's publishing to this program, of the last 1024 samples
+    frames: int  #: frames passed to its controller
+    refused: int  #: commands refused
     unwanted: int  #: failsafe steps while it was flown
-    hover_s: float | None  #: from abandoning it until the failsafe's hover was reported; None: missed
-    landed: bool  #: automatically, afterwards
+    hover_s: float | None  #: time from abandoning it until the failsafe's hover was reported; None if missed
+    landed: bool  #: whether it then landed automatically
 
 
 class Rounds(Controller):
-    """Flies rounds: forward, turning."""
+    """Flies rounds: forward while turning."""
 
     frames = 0
 
@@ -72,7 +72,7 @@ class LookingRounds(Rounds):
 
 
 class _Notes:
-    """The notes on one drone while it is flown."""
+    """What was observed of one drone while it was flown."""
 
     def __init__(self, drone: Drone) -> None:
         self.delays_ns: list[int] = []
@@ -186,12 +186,12 @@ def _judge(watchers: Swarm, flown: Mapping[str, SwarmFlight], let_go_s: Mapping[
 
 
 def missed(flights: list[SwarmFlight]) -> list[str]:
-    """Return the names of the drones whose failsafe was missing, or did not land them."""
+    """Return the names of the drones whose failsafe did not act, or did not land them."""
     return [flight.name for flight in flights if flight.hover_s is None or not flight.landed]
 
 
 def report(flights: list[SwarmFlight]) -> list[list[str]]:
-    """Return the table, with its head first."""
+    """Return the rows of the table, the header first."""
     head = ["drone", "commands", "delay ms: median", "p99", "max", "feedback ms: median", "p99"]
     rows = [[*head, "frames", "refused", "unwanted failsafes", "hover after ms", "landed"]]
     for flight in flights:

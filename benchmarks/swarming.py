@@ -19,7 +19,7 @@ from skyloop.sim.host import SimHost
 from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.options import options_of
 
-#: Small pictures: the speed of drawing on this machine does not matter here.
+#: Small pictures, because the drawing speed of this machine does not matter here.
 VEHICLES: Final = "sim://?world=empty&cameras=front&width=160&height=120&fps=5"
 QUALITY: Final = 70
 _RADIUS_M: Final = 0.5
@@ -32,11 +32,11 @@ class Step(NamedTuple):
     """A vehicle began to fail safe."""
 
     drone: str
-    at_ns: int  #: on the clock of its proxy
+    at_ns: int  #: time on its proxy's clock
 
 
 class Circle(Controller):
-    """Flies a circle with a new command for each sample of feedback, and records the samples' ages."""
+    """Flies a circle with a new command for each feedback sample, and records the samples' ages."""
 
     def __init__(self, drone: Drone, delays_ns: list[int]) -> None:
         super().__init__(drone)
@@ -96,7 +96,7 @@ def fly(pipe: Pipe, place: str, names: list[str]) -> None:
 
 
 def _hover(drone: Drone) -> None:
-    """Wait until it hovers, repeating the request: one made before a link was lost is not sent again."""
+    """Wait until the drone hovers, repeating the request, which is not resent after a lost link."""
     deadline = time.monotonic() + _CONNECTS_WITHIN_S
     while True:
         try:
@@ -105,7 +105,7 @@ def _hover(drone: Drone) -> None:
         except NoAnswerError:
             if time.monotonic() > deadline:
                 raise
-            with suppress(LinkError, AuthorityError):  # the link is lost once more, or control is not back yet
+            with suppress(LinkError, AuthorityError):  # the link was lost again, or control is not back yet
                 drone.takeoff(wait=False)
 
 
@@ -140,7 +140,7 @@ def look_on(pipe: Pipe, place: str, names: list[str]) -> None:
 def bear_witness(pipe: Pipe, place: str, names: list[str]) -> None:
     """Record when vehicles begin to fail safe, and the time and age of each applied command [ns].
 
-    On the request ``"flying"``, it sends the drones that fly at this moment.
+    On the request ``"flying"``, it sends the drones that are flying at this moment.
     """
     pipe.send("ready")
     if pipe.recv() is None:
@@ -154,7 +154,7 @@ def bear_witness(pipe: Pipe, place: str, names: list[str]) -> None:
             commands.append((echo.applied_ns, echo.applied_ns - echo.sent_ns))
 
     def watch(name: str, drone: Drone) -> None:
-        # Each sample of feedback contains the ladder's state, so a lost one hides nothing.
+        # Each feedback sample contains the ladder's state, so a lost sample hides nothing.
         def told(feedback: Feedback) -> None:
             before = newest.get(name)
             if feedback.failsafe is not Failsafe.NONE and before is not None and before.failsafe is Failsafe.NONE:

@@ -24,7 +24,7 @@ _OBSERVED: Final = (f"{FEEDBACK}, observers", f"{VIDEO}, observers")
 
 
 def load_table(results: Load) -> Table:
-    """Return the delays in every case: the pilot's, and the age of frames at the others."""
+    """Return the pilot's delays in every case, and the age of frames at the other applications."""
     rows = [
         [
             case.case,
@@ -67,7 +67,7 @@ def codecs_table(results: CodecResults) -> Table:
 
 
 def network_table(results: Network) -> Table:
-    """Return the shares and ages of arrivals, by connection and loss."""
+    """Return the fractions and ages of arrivals, by connection and loss."""
     rows = [
         [
             f"{case.loss:.0%}",
@@ -95,7 +95,7 @@ def network_table(results: Network) -> Table:
 
 
 def path_table(results: Network) -> Table:
-    """Return the path's own figures, and the bytes of a sample on it."""
+    """Return the path's own figures, and the bytes that each sample takes on it."""
     rows = [["maximum throughput", f"{results.megabytes_per_s:.0f} MB/s"]]
     late = max(case.relay.p99_us for case in results.cases)
     typical = max(case.relay.median_us for case in results.cases)
@@ -138,7 +138,7 @@ def swarm_table(results: Sequence[Swarm]) -> Table:
 
 
 def scale_table(results: Scale, many: str) -> Table:
-    """Return the cases of growing ``"proxies"``, each with its observer, or ``"observers"`` of one proxy."""
+    """Return the cases with growing numbers of ``"proxies"``, each with an observer, or of one's ``"observers"``."""
     series = results.series(many)
     rows = [[str(case.observers), *_scale_cells(case)] for case in series]
     columns = [
@@ -202,7 +202,7 @@ def mavlink_table(case: MavlinkResult) -> Table:
 
 
 def bend_text(results: Scale, many: str) -> str:
-    """Return in words where a series becomes worse than its beginning."""
+    """Return a sentence on where a series becomes worse than at its beginning."""
     series = results.series(many)
     bend = bends(series, results.machine.cores)
     if bend is None:
@@ -212,7 +212,7 @@ def bend_text(results: Scale, many: str) -> str:
 
 
 def units_table(units: Units) -> Table:
-    """Return the costs of one of each."""
+    """Return the unit costs."""
     rows = [
         ["a proxy with its pilot, each second", f"{units.proxy_us_per_s / 1e3:.1f} ms", f"{units.proxy_mb:.0f} MB"],
         ["a pilot, each second and drone", f"{units.pilot_us_per_s / 1e3:.1f} ms", ""],

@@ -19,11 +19,11 @@ from benchmarks.measuring.schedule import COMMAND, FEEDBACK, MIDDLE, VIDEO
 from benchmarks.measuring.targets import Verdict
 
 MOST_OBSERVERS: Final = 32
-OBSERVED_P99: Final = 2.0  #: the pilot's command, with that many observers to none
+OBSERVED_P99: Final = 2.0  #: ratio of the pilot's command delay with that many observers to that with none
 MOST_PAGES: Final = 10
-PAGED_P99: Final = 1.5  #: the pilot's command, with that many pages of a cockpit to none
-RECORDED_MEDIAN: Final = 1.1  #: the pilot's command, with a recorder to none
-STUCK_MEDIAN: Final = 1.1  #: feedback of the other observers, with one stopped to none: practically no change
+PAGED_P99: Final = 1.5  #: ratio of the pilot's command delay with that many cockpit pages to that with none
+RECORDED_MEDIAN: Final = 1.1  #: ratio of the pilot's command delay with a recorder to that with none
+STUCK_MEDIAN: Final = 1.1  #: ratio of the other observers' feedback delay with one stopped to that with none
 
 
 def judge_load(results: Load) -> list[Verdict]:
@@ -59,7 +59,7 @@ def _judge_recorder(results: Load) -> list[Verdict]:
     for name in (RECORDED, KILLED, FULL):
         recorded = results.case(name, MIDDLE, RECORDED_PERIOD_S)
         if name == FULL and recorded and not recorded.recorder_stopped:
-            continue  # its disk had room for all
+            continue  # its disk had enough space
         if quiet and recorded:
             figure = recorded.channels[COMMAND].median_us / quiet.channels[COMMAND].median_us
             verdicts.append(Verdict(f"command: median with a {name} to none", figure, RECORDED_MEDIAN))

@@ -32,7 +32,7 @@ OVERLAP: Final = 0.5
 NEAR_PX: Final = 20.0
 OVERLAPS: Final = tuple(n / 20 for n in range(21))  #: thresholds of the success curve
 DISTANCES_PX: Final = tuple(range(0, 51, 2))  #: thresholds of the precision curve
-BINS: Final = (0.45, 0.6, 0.7, 0.8, 0.9, 1.001)  #: of scores
+BINS: Final = (0.45, 0.6, 0.7, 0.8, 0.9, 1.001)  #: limits of the bins of scores
 
 Make = Callable[[], Tracker]
 
@@ -59,9 +59,9 @@ class TrackerResults(msgspec.Struct, frozen=True):
 
     group: str
     tracker: str
-    in_view: int  #: images with the target in view
-    hidden: int  #: images without
-    success: list[float]  #: share of the images in view, for each of OVERLAPS
+    in_view: int  #: number of images with the target in view
+    hidden: int  #: number of images without the target in view
+    success: list[float]  #: fraction of the images in view that reach each of OVERLAPS
     precision: list[float]  #: the same for each of DISTANCES_PX
     wrong: int  #: images in view with a box that overlaps by less than OVERLAP
     ghosts: int  #: images without the target in view that have a box
@@ -70,12 +70,12 @@ class TrackerResults(msgspec.Struct, frozen=True):
 
     @property
     def successes(self) -> float:
-        """Share of the images in view with an overlap of OVERLAP or more."""
+        """Fraction of the images in view with an overlap of OVERLAP or more."""
         return self.success[OVERLAPS.index(OVERLAP)]
 
     @property
     def near(self) -> float:
-        """Share of the images in view within NEAR_PX."""
+        """Fraction of the images in view within NEAR_PX."""
         return self.precision[DISTANCES_PX.index(NEAR_PX)]
 
 
@@ -87,7 +87,7 @@ class TrackingResults(msgspec.Struct, frozen=True):
 
 
 def trackers() -> dict[str, Make]:
-    """Return ours, and the weight-free ones of this OpenCV."""
+    """Return our trackers, and the weight-free ones of this OpenCV."""
     found: dict[str, Make] = {
         "LongTermTracker": LongTermTracker,
         "CorrelationTracker": CorrelationTracker,
@@ -107,7 +107,7 @@ def groups(film: Path | None, quick: bool = False) -> dict[str, list[Sequence]]:
     if film is not None:
         labels = read_labels()
         frames = read_film(film, 24 if quick else None)
-        # Every second frame: the run should take about a minute.
+        # Only every second frame, so that the run takes about a minute.
         halved = {name: {n // 2: box for n, box in boxes.items()} for name, boxes in labels.objects.items()}
         found["film"] = [fixed(name, frames[::2], boxes) for name, boxes in halved.items()]
         found["film, moved"] = [
@@ -173,7 +173,7 @@ def _row(group: str, name: str, make: Make, sequences: Iterable[Sequence]) -> Tr
 
 
 def _distance(found: TrackResult, truth: Box) -> float:
-    """Return the distance of the centres [px]; infinity while lost."""
+    """Return the distance between the centres [px]; infinity while lost."""
     if found.centre is None:
         return math.inf
     return math.dist(found.centre, (truth[0] + (truth[2] - 1) / 2, truth[1] + (truth[3] - 1) / 2))
@@ -219,7 +219,7 @@ def draw(results: TrackingResults, file: Path) -> None:
         left.plot(OVERLAPS, row.success, label=row.tracker)
         right.plot(DISTANCES_PX, row.precision, label=row.tracker)
         left.set(title=f"{row.group}: success", xlabel="overlap, at least", ylim=(-0.03, 1.03))
-        right.set(title=f"{row.group}: precision", xlabel="distance of the middles [px], at most")
+        right.set(title=f"{row.group}: precision", xlabel="distance between the centres [px], at most")
     for each in axes.ravel():
         each.grid(alpha=0.3)
     axes[0][0].legend(frameon=False, fontsize=8, loc="lower left")

@@ -20,7 +20,7 @@ LABELS = Path(__file__).parents[1] / "tests" / "data" / "tracking" / "ardrone2-d
 class Labels(msgspec.Struct, frozen=True):
     """Boxes in a film."""
 
-    film: str  #: its place among the recorded fixtures
+    film: str  #: path of the film within the recorded fixtures
     size: tuple[int, int]  #: width and height of a frame [px]
     how: str  #: how the boxes were made
     objects: dict[str, dict[int, Box]]  #: name → number of the frame → x, y, width, height [px]
@@ -31,7 +31,7 @@ def read_labels(path: Path = LABELS) -> Labels:
 
     Raises:
         UsageError: There is no such file.
-        FileFormatError: It has no labels.
+        FileFormatError: The file has no labels.
     """
     return read_json(path, Labels, "labelled boxes of a film", _MOST_BYTES)
 
@@ -41,11 +41,11 @@ def read_film(path: Path, most: int | None = None) -> NDArray[np.uint8]:
 
     Args:
         path: The PaVE stream.
-        most: Number of frames, from the first; None: all.
+        most: Number of frames, from the first; None for all.
 
     Raises:
         UsageError: There is no such file.
-        FileFormatError: Nothing in it can be decoded.
+        FileFormatError: Nothing in the file can be decoded.
         MissingExtraError: PyAV is not installed.
     """
     from skyloop.vehicles.ardrone.pave_decoder import PaveDecoder

@@ -48,8 +48,8 @@ def scene(kind: str, seed: int, count: int = 120) -> Sequence:
     """Return a drawn sequence of ``count`` images, reproducibly.
 
     Args:
-        kind: ``plain``: it moves and changes its size; ``light``: the light changes, too; ``hidden``: a pillar hides it
-          a fifth of the time; ``leaves``: it leaves the image and comes back; ``look-alike``: another thing of the same
+        kind: ``plain``: it moves and changes size; ``light``: the light changes, too; ``hidden``: a pillar hides it
+          a fifth of the time; ``leaves``: it leaves the image and comes back; ``look-alike``: an object of the same
           colours crosses its path, and stays in view while a pillar hides the target.
         seed: Seed of all randomness.
         count: Number of images.
@@ -117,7 +117,7 @@ def fixed(name: str, film: NDArray[np.uint8], labels: dict[int, Box]) -> Sequenc
 
 
 def moved(name: str, film: NDArray[np.uint8], labels: dict[int, Box], count: int, seed: int) -> Sequence:
-    """Return a film as seen by a camera that pans and zooms over it; edge pixels are repeated beyond it.
+    """Return a film as seen by a camera that pans and zooms over it; beyond it, its edge pixels are repeated.
 
     Args:
         name: Name of the target.

@@ -1,8 +1,8 @@
 """Fit and validate the confidence of the long-term tracker's scores: ``python -m benchmarks.tracking_street``.
 
 A camera circles figures of the simulator's outdoor worlds, whose true boxes are known. On some seeds a monotone
-function is fitted from the score to the fraction of boxes that overlap the true one by half or more; the table is from
-other seeds.
+function is fitted from the score to the fraction of boxes that overlap the true one by half or more; the table comes
+from other seeds.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ HELD_BACK_SEEDS: Final = range(100, 108)
 PERIOD_S: Final = 0.1
 OVERLAP: Final = 0.5
 KNOTS: Final = (0.45, 0.55, 0.65, 0.75, 0.85, 0.95)  #: centres of the score bins
-_LEAST_PX: Final = 24  # height of a target at the start
+_LEAST_PX: Final = 24  # minimum height of a target at the start
 _MODEL: Final = CameraModel("bench", 320, 240, 10.0, 240.0, 240.0, 159.5, 119.5)
 
 
@@ -80,7 +80,7 @@ def _seen(world_name: str, seed: int, count: int) -> Iterator[Step]:
 
 
 def scored(sequences: Iterable[Sequence]) -> list[tuple[float, bool]]:
-    """Return score and whether the overlap is a half or more, for each box that the long-term tracker returns."""
+    """Return the score, and whether the overlap is a half or more, of each box that the long-term tracker returns."""
     found = []
     for sequence in sequences:
         tracker, started = LongTermTracker(), False
@@ -98,8 +98,8 @@ def scored(sequences: Iterable[Sequence]) -> list[tuple[float, bool]]:
 
 
 def fitted(pairs: list[tuple[float, bool]]) -> tuple[float, ...]:
-    """Return a monotone share for each of KNOTS: that of its bin, pulled towards a half by two boxes, and pooled."""
-    blocks: list[list[float]] = []  # share, weight, knots
+    """Return a monotone fraction for each of KNOTS: that of its bin, pulled towards a half by two boxes, and pooled."""
+    blocks: list[list[float]] = []  # fraction, weight, knots
     for knot in KNOTS:
         goods = [good for score, good in pairs if abs(score - knot) <= 0.05]
         blocks.append([(sum(goods) + 1) / (len(goods) + 2), len(goods) + 2, 1])
@@ -111,7 +111,7 @@ def fitted(pairs: list[tuple[float, bool]]) -> tuple[float, ...]:
 
 
 def reliability(pairs: list[tuple[float, bool]], shares: tuple[float, ...]) -> list[tuple[str, int, float, float]]:
-    """Return bins of confidence: range, boxes, mean confidence, observed share."""
+    """Return bins of confidence: range, boxes, mean confidence, observed fraction."""
     confidences = np.interp([score for score, _ in pairs], KNOTS, shares)
     goods = np.array([good for _, good in pairs])
     rows = []

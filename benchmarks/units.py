@@ -20,13 +20,13 @@ _MB: Final = 1e6
 class Units(msgspec.Struct, frozen=True):
     """Processor time in µs, memory in MB, bytes on the wire."""
 
-    proxy_us_per_s: float  #: of a proxy with a pilot, each second, with its commands and its feedback to the pilot
-    pilot_us_per_s: float  #: of a pilot, each second and drone
+    proxy_us_per_s: float  #: of a proxy with a pilot, per second, including commands and feedback to the pilot
+    pilot_us_per_s: float  #: of a pilot, per second and drone
     feedback_sent_us: float  #: by a proxy, for each further observer
     feedback_received_us: float  #: by an observer's process, including its other work
-    jpeg_us: float  #: to encode one frame, once for all clients of the same form
+    jpeg_us: float  #: to encode one frame, once for all clients of one format
     frame_sent_us: float  #: by a proxy, for each observer
-    frame_received_us: float  #: by an observer, decoding included
+    frame_received_us: float  #: by an observer, including decoding
     feedback_routed_us: float  #: by a router, for each observer
     frame_routed_us: float
     proxy_mb: float
@@ -90,7 +90,7 @@ class Fleet(msgspec.Struct, frozen=True):
     drones: int = 1000
     sites: int = 20  #: network segments with a router each, joined through a central router
     observers: int = 2  #: of each drone, for feedback; half of them at another site
-    viewers: int = 1  #: of these, also for video
+    viewers: int = 1  #: observers of each drone that also get video
     frames_per_s: float = 10.0
     busy: float = 0.6  #: maximum use of a core
 
@@ -109,16 +109,16 @@ class Needs(msgspec.Struct, frozen=True):
     tokens: int  #: liveliness tokens: one per proxy, one per connection
     proxy_memory_gb: float
     observer_memory_gb: float
-    cores: int  #: in all, with none busier than allowed
-    mesh_links: int  #: links if all called one another instead of their site's router
+    cores: int  #: total, with none busier than allowed
+    mesh_links: int  #: links if all connected to one another instead of their site's router
 
 
 def needs(fleet: Fleet, units: Units) -> Needs:
-    """Return the needs of a fleet, from the costs of one of each.
+    """Return the needs of a fleet, from the unit costs.
 
-    Non-linear effects (a crowded machine's scheduler, its caches) are not included. Proxies connect to their site's
-    router, so each sends everything once; the router multiplies it. Pilots are at the site of their drone; half of the
-    observers, and of the viewers among them, are at other sites.
+    Non-linear effects, such as a crowded machine's scheduler and caches, are not included. Proxies connect to their
+    site's router, so each sends everything once, and the router distributes it. Pilots are at the site of their drone;
+    half of the observers, and of the viewers among them, are at other sites.
     """
     site_drones = fleet.drones / fleet.sites
     away_observers, away_viewers = fleet.observers / 2, fleet.viewers / 2

@@ -17,7 +17,7 @@ class Judge:
     """Measures the quality of some of the pictures.
 
     Args:
-        received: Called for each.
+        received: Called for each measurement.
     """
 
     def __init__(self, received: Received) -> None:
@@ -26,7 +26,7 @@ class Judge:
         self._count = 0
 
     def look(self, image: Image, stamp_ns: int) -> None:
-        """Judge a picture, after it counted as shown."""
+        """Judge a picture that has been counted as shown."""
         self._count += 1
         if self._count % JUDGED:
             return

@@ -32,7 +32,7 @@ WEBRTC: Final = "WebRTC (aiortc)"
 CONTENDERS: Final = (*FORMS, WEBRTC)
 PYTHON_VARIABLE: Final = "SKYLOOP_AIORTC_PYTHON"
 DELAY_S: Final = 0.02  #: each way, in addition to the wait for capacity
-GOOD_KBIT_S: Final = 300.0  #: the path is judged in those seconds of a trace that carry this much
+GOOD_KBIT_S: Final = 300.0  #: only seconds of a trace that carry this much are judged
 FROZEN_MS: Final = 250.0 + 1000.0 / FPS  #: the picture counts as frozen while the newest one shown is older
 _PATH: Final = Impairments(delay_s=DELAY_S)
 _SEED: Final = 8
@@ -57,19 +57,19 @@ class PathCase(msgspec.Struct, frozen=True):
 
     trace: str
     contender: str
-    carried_kbit_s: float  #: by the path, on average over all the time
-    sent_kbit_s: float  #: of it, used by everything the vehicle sent
-    good_share: float  #: share of the time with enough capacity; the fields below refer to it, except two
-    video: Ages | None  #: age of each picture on arrival at the application; None: none arrived
+    carried_kbit_s: float  #: by the path, on average over the whole time
+    sent_kbit_s: float  #: part of that used by everything the vehicle sent
+    good_share: float  #: fraction of the time with enough capacity, to which all but two of the fields below refer
+    video: Ages | None  #: age of each picture on arrival at the application; None if none arrived
     frozen_share: float | None
-    unavoidable_share: float  #: share in which a frozen picture was unavoidable
+    unavoidable_share: float  #: fraction in which a frozen picture was unavoidable
     frozen_of_all: float | None  #: of the whole time, at any capacity …
     unavoidable_of_all: float  #: … and the unavoidable part of that
     pictures_per_s: float
     psnr_db: float | None
     feedback: Ages | None
     command: Ages | None
-    commands_share: float  #: share executed, of those sent at any time
+    commands_share: float  #: fraction of all commands sent that were executed
     shown: list[tuple[int, int]] = []  #: time of arrival [ms] and age of each picture; of one trace only
 
 
@@ -108,8 +108,8 @@ def measure(
     Args:
         seconds: Duration of each case, from the beginning of the trace [s].
         traces: Capacities of the path to the pilot.
-        contenders: Of :data:`CONTENDERS`.
-        progress: Called with the share done, 0 to 1, and the next step.
+        contenders: Some of :data:`CONTENDERS`.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
         UnsupportedError: No hosts can be created here.
@@ -121,7 +121,7 @@ def measure(
     wanted = [(trace, contender) for trace in traces for contender in contenders if contender not in skipped]
     for index, (trace, contender) in enumerate(wanted):
         progress(index / len(wanted), f"{trace.name}, {contender}")
-        with Lab() as lab, Workers() as workers:  # a lab for each: WebRTC uses any path it finds
+        with Lab() as lab, Workers() as workers:  # a separate lab for each, because WebRTC uses any path it finds
             hosts = lab.host("vehicle"), lab.host("pilot")
             case = _Stage(lab, workers, hosts, contender, python).play(trace, seconds)
         if trace.name != wanted[0][0].name:
@@ -159,7 +159,7 @@ class _Stage:
 
 
 def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals: Arrivals, sent_bytes: int) -> PathCase:
-    """Compute the figures of the arrivals. Pure.
+    """Compute the figures from the arrivals. Pure.
 
     Args:
         contender: Its name.
@@ -177,7 +177,7 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
     in_time = [age for at, age in shown if good[int(at // _SECOND_MS)]]
     qualities = [(float(name.removeprefix(QUALITY)), pairs) for name, pairs in arrivals.items() if QUALITY in name]
     judged = sum(len(pairs) for _, pairs in qualities)
-    # Pictures captured before the start are unknown: nothing counts as frozen until they would.
+    # Pictures captured before the start are unknown, so nothing counts as frozen until their age would be too great.
     steps = np.arange(FROZEN_MS, seconds * _SECOND_MS, _STEP_MS)
     counts = np.array([good[int(ms // _SECOND_MS)] for ms in steps])
     commands, delay_ms = arrivals.get(COMMAND, []), DELAY_S * 1e3
@@ -204,7 +204,7 @@ def judge(contender: str, trace: Trace, seconds: float, begin_ns: int, arrivals:
 
 
 def _newest_first(pairs: list[tuple[int, int]], begin_ns: int, seconds: float) -> list[tuple[float, float]]:
-    """Return the arrival time of each picture, from the start [ms], and its age; without overtaken ones."""
+    """Return each picture's arrival time, from the start [ms], and its age, without overtaken pictures."""
     found, newest_ns = [], -1
     for sent_ns, received_ns in sorted(pairs, key=lambda pair: pair[1]):
         at_ms = (received_ns - begin_ns) / 1e6
@@ -229,7 +229,7 @@ def _ages(ages_ms: list[float]) -> Ages | None:
 
 
 def _frozen(shown: list[tuple[float, float]], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each of the steps [ms] whether the newest picture shown is too old."""
+    """Return whether the newest picture shown is too old at each of the steps [ms]."""
     if not shown:
         return np.ones(len(steps), dtype=np.bool_)
     came = np.array([at for at, _ in shown])
@@ -278,7 +278,7 @@ def load(path: File) -> VideoPath:
     """Read ``video_path.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, VideoPath, "the results of benchmarks.video_path", MAX_RESULTS)
 

@@ -1,7 +1,7 @@
 """Follow a person without a marker, by detector and appearance; then circle the person, then only turn to them.
 
 python examples/follow_anything.py                       # a simulated park
-python examples/follow_anything.py alpha my.onnx         # a running proxy, by your own network
+python examples/follow_anything.py alpha my.onnx         # a running proxy, with your own network
 """
 
 import sys

@@ -31,7 +31,7 @@ def main(target: str = "sim://", seconds: float | str = 30.0) -> None:
     print(f"in view in {score.share_in_view or 0.0:.0%} of {score.frames} frames since it was found")
     if errors := score.range_errors_m(after_s=3.0):
         rms = math.sqrt(sum(error**2 for error in errors) / len(errors))
-        print(f"distance off by {rms:.2f} m RMS, from three seconds after that")
+        print(f"distance off by {rms:.2f} m RMS, starting three seconds later")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""For all tests."""
+"""Shared by all tests."""
 
 import os
 import random
@@ -16,9 +16,9 @@ from hypothesis import settings
 
 TESTS = Path(__file__).parent
 
-# Properties are tested with the same examples each time, so that a person's run gives the same answer each time. New
-# ones are looked for where somebody asks (make explore), for so many seconds: what that finds becomes an @example.
-# A busy machine is no failure; what hangs is ended by the tests' time-out.
+# Property-based tests use the same examples in every run, so that results are reproducible. `make explore` searches for
+# new ones for this many seconds; add its findings as @example. There are no deadlines, because the machine may be busy;
+# the tests' time-out ends a test that hangs.
 EXPLORE_S = float(os.environ.get("SKYLOOP_EXPLORE", "0"))
 settings.register_profile("skyloop", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None, derandomize=False, print_blob=True)
@@ -26,19 +26,19 @@ settings.load_profile("explore" if EXPLORE_S else "skyloop")
 _EXPLORING_ENDS_S = pytest.StashKey[float]()
 _EXIT_STATUS = pytest.StashKey[int]()
 
-# Before any test module imports them: a failing assertion of the public suites then shows its values.
+# Must run before any test module imports them, so that a failing assertion in the public suites shows its values.
 pytest.register_assert_rewrite("skyloop.transport.conformance", "skyloop.transport.testing", "skyloop.drivers.suite")
 
 # A shell ignores SIGINT for its background jobs, and children inherit that: the commands that the tests start and
-# interrupt would never hear of it.
+# interrupt would never receive it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# Folders whose processes mostly fly. Measuring their coverage would slow flights down and find what others have found.
+# Folders whose processes mostly fly. Measuring their coverage would slow the flights down and find nothing new.
 FLIGHTS = {"benchmarks", "docs", "examples", "processes", "third_party", "test_bench.py", "test_demo.py"}
 
-# Folders of which `make test` leaves everything out: promises kept for minutes, under faults, or between several hosts.
+# Folders that `make test` leaves out: promises kept for minutes, under faults, or between several hosts.
 SLOW = {"benchmarks", "faults", "fuzz", "hardware", "hosts", "security", "third_party"}
 
 
@@ -47,7 +47,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         others = [item for item in items if not getattr(getattr(item, "obj", None), "is_hypothesis_test", False)]
         config.hook.pytest_deselected(items=others)
         items[:] = [item for item in items if item not in set(others)]
-        random.shuffle(items)  # the time is over before all had their turn
+        random.shuffle(items)  # because there is not enough time for all of them
     for item in items:
         parts = item.path.relative_to(TESTS).parts
         process = item.get_closest_marker("process") is not None
@@ -58,7 +58,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_runtestloop(session: pytest.Session) -> None:
-    if EXPLORE_S:  # from here on: collecting the tests takes a while by itself
+    if EXPLORE_S:  # counts from here, because collecting the tests takes a while
         session.config.stash[_EXPLORING_ENDS_S] = time.monotonic() + EXPLORE_S
 
 
@@ -69,8 +69,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_unconfigure(config: pytest.Config) -> None:
-    """A run whose tests left threads behind that Python would wait for says which, and ends: a test that failed before
-    it closed its network session would let the run hang for ever."""
+    """Report threads that tests left behind, and exit: Python would wait for them forever.
+
+    A test that fails before it closes its network session leaves such a thread.
+    """
     left = [each for each in threading.enumerate() if each is not threading.main_thread() and not each.daemon]
     for each in left:
         each.join(1.0)
@@ -86,7 +88,7 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A user's directory of state for the tests alone: what proxies write there is nobody's flight."""
+    """Use a separate state directory, so that the proxies of tests leave no traces in the user's."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -94,7 +96,7 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def trusted_networks() -> Iterator[None]:
-    """Load the tests' own ONNX files without a child process that tries each first; tests/promises tries them."""
+    """Load the tests' own ONNX files without first trying each in a child process, which tests/promises does."""
     with pytest.MonkeyPatch.context() as patch:
         if find_spec("onnxruntime"):
             patch.setattr("skyloop.vision.onnx.try_alone", lambda *files, tracker="": None)
@@ -103,7 +105,7 @@ def trusted_networks() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def traced() -> Iterator[None]:
-    """Let coverage see what Zenoh calls on threads of its own, which Python's tracing does not reach by itself."""
+    """Let coverage see the code that Zenoh calls on its own threads, which Python's tracing does not cover."""
     hook = threading.gettrace()
     if hook is None:
         yield

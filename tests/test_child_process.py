@@ -1,4 +1,4 @@
-"""Child processes: they end when they are told to, at once or after signals, and with their parent."""
+"""Child processes end on request, at once or after signals, and with their parent."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def running(code: str, *, keep_errors: bool = True) -> Iterator[ChildProcess]:
 
 @pytest.mark.process
 @pytest.mark.daily
-def test_a_child_ends_when_its_input_does_and_its_last_words_stay_known() -> None:
+def test_a_child_ends_with_its_input_and_its_last_output_stays_available() -> None:
     with running(
         "import sys; print('ready', flush=True); sys.stdin.read(); sys.exit('x' * 3000 + 'no vehicle')"
     ) as child:
@@ -54,7 +54,7 @@ def test_a_child_ends_when_its_input_does_and_its_last_words_stay_known() -> Non
 
 
 @pytest.mark.process
-def test_one_that_does_not_end_is_terminated_and_at_last_killed() -> None:
+def test_a_child_that_does_not_end_is_terminated_and_finally_killed() -> None:
     stubborn = """
         import signal, time
         signal.signal(signal.SIGTERM, signal.{})
@@ -99,7 +99,7 @@ def test_a_command_that_can_not_be_started_leaves_nothing() -> None:
     assert set(Path("/proc/self/fd").iterdir()) <= before
 
 
-def test_the_end_of_the_parents_pipe_is_heard() -> None:
+def test_the_end_of_the_parents_pipe_is_detected() -> None:
     reading, writing = os.pipe()
     ended = threading.Event()
     on_parent_end(ended.set, reading)
@@ -114,7 +114,7 @@ def test_the_end_of_the_parents_pipe_is_heard() -> None:
 
 
 def test_a_fork_leaves_the_child_of_its_parent_alone() -> None:
-    """What a fork of this process does to its copy of the object; the process itself goes on."""
+    """A fork of this process ends its copy of the object; the child process continues."""
     code = "import sys; print('x', flush=True); sys.stdin.read(); print('y', flush=True)"
     child = ChildProcess([sys.executable, "-c", code])
     assert child.stdout.readline() == b"x\n"
@@ -137,7 +137,7 @@ def restarting(code: str, ended: Callable[[ChildProcess | None, str], float | No
     )
 
 
-def test_a_restart_that_fails_is_told_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_restart_is_reported_and_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     """No descriptors were left for a moment: one failed restart must not end the supervision for good."""
     endings: list[str] = []
     real = ChildProcess
@@ -163,7 +163,7 @@ def test_a_restart_that_fails_is_told_and_tried_again(monkeypatch: pytest.Monkey
     assert child.over
 
 
-def test_no_child_is_started_after_one_that_says_it_is_over() -> None:
+def test_no_child_is_started_after_one_that_has_finished() -> None:
     child = restarting("raise SystemExit(2)", lambda *_: None)
     child.start()
     wait_until(lambda: child.over, "it is over")

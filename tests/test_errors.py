@@ -1,4 +1,4 @@
-"""Errors travel between processes: what a worker raises arrives as it was."""
+"""Errors travel between processes: an error raised in a worker arrives unchanged."""
 
 from __future__ import annotations
 

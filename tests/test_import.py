@@ -1,4 +1,4 @@
-"""``import skyloop`` is quick, and offers what it says."""
+"""``import skyloop`` is quick, and provides its documented names."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_every_name_is_there(name: str) -> None:
     assert name in dir(skyloop)
 
 
-def test_names_are_those_of_their_homes() -> None:
+def test_names_match_their_home_modules() -> None:
     homes = {name: home for name, home in _stub_names() if home != "skyloop"}
     assert {*homes, "aio", "__version__"} == set(NAMES)
     for name, home in homes.items():
@@ -89,6 +89,6 @@ def test_version() -> None:
 
 
 @pytest.mark.parametrize("name", ["layout", "pictures", "reader"])
-def test_recordings_are_read_by_their_former_address_too(name: str) -> None:
+def test_recordings_can_be_read_by_the_former_import_path_too(name: str) -> None:
     former = importlib.import_module(f"skyloop.logfile.{name}")
     assert former is importlib.import_module(f"skyloop.recording.{name}")

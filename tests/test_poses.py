@@ -1,4 +1,4 @@
-"""Poses against what is known of them, and against the truth of a simulated flight."""
+"""Poses compared with known values, and with the truth of a simulated flight."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ def test_cameras_are_where_the_simulator_has_them(
     assert back.as_matrix() == pytest.approx(camera_in_body(FRONT).as_matrix(), abs=1e-9)
 
 
-def test_a_position_from_elsewhere_goes_first() -> None:
+def test_a_given_position_takes_precedence() -> None:
     feedback = Feedback(captured_ns=0, position_m=(9.0, 9.0, 9.0), roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0)
     assert body_in_world(feedback, (1.0, 2.0, 3.0)).translation == pytest.approx([1.0, 2.0, 3.0])
 
 
-def test_what_is_not_known_is_said() -> None:
+def test_missing_values_and_invalid_poses_are_refused() -> None:
     with pytest.raises(UsageError, match="does not report its position"):
         body_in_world(Feedback(captured_ns=0, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0))
     with pytest.raises(UsageError, match="attitude"):
@@ -65,7 +65,7 @@ def test_what_is_not_known_is_said() -> None:
             transform(position, rotation)
 
 
-def test_a_marker_that_is_carried_about_is_placed_in_the_world_from_a_flight() -> None:
+def test_a_moving_marker_is_located_in_the_world_from_a_flight() -> None:
     """With the simulator's noise in pictures, attitude and position, and the state at each picture's capture."""
     pytest.importorskip("cv2", reason="markers are found with OpenCV")
     from skyloop.stepping.rehearsal import rehearse

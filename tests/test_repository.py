@@ -1,4 +1,4 @@
-"""What holds the repository together: floors of coverage, budgets of rooms and paths, and the locked versions."""
+"""Checks of the repository: coverage floors, budgets of rooms and paths, and locked versions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def tracer() -> ModuleType:
 
 
 def report(total: float, **modules: float) -> dict[str, Any]:
-    """What ``coverage json`` writes, of modules whose dots stand for slashes."""
+    """Return a report as written by ``coverage json``; dots in the names of modules replace slashes."""
     files = {
         f"src/skyloop/{name.replace('__', '/')}.py": {"summary": {"percent_covered": percent}, "missing_lines": [3, 5]}
         for name, percent in modules.items()
@@ -55,7 +55,7 @@ def report(total: float, **modules: float) -> dict[str, Any]:
     return {"totals": {"percent_covered": total}, "files": files}
 
 
-def test_the_package_names_no_account_that_is_not_the_projects() -> None:
+def test_the_package_names_no_foreign_accounts() -> None:
     text = (ROOT / "pyproject.toml").read_text()
     assert "github" not in text.lower()
     assert "urls" not in tomllib.loads(text)["project"]
@@ -80,7 +80,7 @@ def test_a_module_of_the_core_below_its_floor(floor: ModuleType) -> None:
     assert found == "coverage of transport/local/client.py is 89.9 %, and must be at least 90 %: 3, 5"
 
 
-def test_an_exception_is_let_pass_until_it_is_none(floor: ModuleType) -> None:
+def test_an_exception_may_miss_the_floor_until_it_reaches_it(floor: ModuleType) -> None:
     exceptions = {"network/keys/files.py": "a reason"}
     assert floor.failures(report(95.0, network__keys__files=80.0), exceptions) == []
     assert floor.obsolete(report(95.0, network__keys__files=80.0), exceptions) == []
@@ -118,7 +118,7 @@ class Small:
 '''
 
 
-def test_what_is_measured_of_a_module(gauge: ModuleType) -> None:
+def test_the_figures_of_a_module(gauge: ModuleType) -> None:
     known = {"p", "p.a", "p.b", "p.c", "p.d", "p.e"}
     found = gauge.measure_file("p.e", MODULE, "control", known)
     assert (found.lines, found.code, found.import_lines, found.core_uses) == (23, 12, 5, 1)
@@ -211,5 +211,5 @@ def test_the_lock_file_has_a_version_that_fits_for_each_requirement() -> None:
         assert all(requirement.specifier.contains(version) for version in fits), f"{requirement}, {fits}: make lock"
 
 
-def test_the_lock_file_names_no_place() -> None:
+def test_the_lock_file_names_no_index_or_path() -> None:
     assert not re.search(r"(?m)^-|://|@", (ROOT / "requirements-dev.lock").read_text())

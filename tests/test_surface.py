@@ -1,6 +1,6 @@
-"""What users may rely on: the names of the documented modules, and what a drone and a swarm show. No more is public.
+"""The public API: names of the documented modules, and the attributes of a drone and a swarm. Nothing else is public.
 
-``python -m tests.test_surface`` writes ``tests/data/public.txt`` anew: what is added there is promised from then on.
+``python -m tests.test_surface`` rewrites ``tests/data/public.txt``; names added there become promises.
 """
 
 from __future__ import annotations

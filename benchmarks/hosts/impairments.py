@@ -1,4 +1,4 @@
-"""The impairments of a path, decided by a seed; time is an argument."""
+"""The impairments of a path, determined by a seed; time is an argument."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Impairments:
 
     loss: float = 0.0
     delay_s: float = 0.0
-    jitter_s: float = 0.0  #: maximum addition to the delay, uniform; order is kept
-    reorder: float = 0.0  #: share held back …
-    reorder_s: float = 0.01  #: … for this much longer, so that later ones overtake
-    trace: Trace | None = None  #: its capacity: packets first wait for that, and then for all of the above
+    jitter_s: float = 0.0  #: maximum of a uniform addition to the delay, which keeps the order
+    reorder: float = 0.0  #: fraction of packets held back …
+    reorder_s: float = 0.01  #: … for this much longer, so that later packets overtake them
+    trace: Trace | None = None  #: capacity of the path: packets first wait for that, then for all of the above
 
     def __post_init__(self) -> None:
         for name in ("loss", "reorder"):
@@ -44,7 +44,7 @@ class Way:
     """One direction of a path: packets enter, and leave when their time has come.
 
     Args:
-        seed: Decides the fate of each packet.
+        seed: Determines the fate of each packet.
         impairments: The effects on packets.
     """
 
@@ -60,7 +60,7 @@ class Way:
     def put(self, packet: bytes, now_ns: int) -> None:
         """Add a packet."""
         wrong, chance = self.impairments, self._random.random
-        # Always three draws: a packet's fate depends on its number, not on earlier rates.
+        # Always draw three numbers, so that a packet's fate depends on its number, not on earlier rates.
         lost, held, jitter = chance() < wrong.loss, chance() < wrong.reorder, chance() * wrong.jitter_s
         if lost:
             self.lost += 1
@@ -81,7 +81,7 @@ class Way:
         heapq.heappush(self._waiting, (due_ns, self._number, packet))
 
     def get(self, now_ns: int) -> tuple[int, bytes] | None:
-        """Return the next packet whose time has come, and that time [ns]; None if none has."""
+        """Return the next packet that is due, and when it was due [ns]; None if there is none."""
         if self._waiting and self._waiting[0][0] <= now_ns:
             due_ns, _, packet = heapq.heappop(self._waiting)
             return due_ns, packet
@@ -89,5 +89,5 @@ class Way:
 
     @property
     def next_ns(self) -> int | None:
-        """When the next packet is due [ns]; None if none waits."""
+        """When the next packet is due [ns]; None if none is waiting."""
         return self._waiting[0][0] if self._waiting else None

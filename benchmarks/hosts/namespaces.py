@@ -20,8 +20,8 @@ from skyloop.errors import UnsupportedError, UsageError
 _Entered = TypeVar("_Entered")
 _PROGRAMS: Final = {"ip": "iproute2", "nsenter": "util-linux", "unshare": "util-linux"}
 _TUN: Final = Path("/dev/net/tun")
-_WITHIN_S: Final = 20.0  # takes milliseconds on a healthy machine
-# It prints its number, and ends with the pipe, and so with its creator: then the kernel removes the namespaces.
+_WITHIN_S: Final = 20.0  # time allowed for what takes milliseconds on a healthy machine
+# It prints its number and ends with the pipe, and thus with its creator; then the kernel removes the namespaces.
 _HOLD: Final = 'echo "$1" > /proc/sys/kernel/hostname && echo $$ && exec cat'
 
 
@@ -49,7 +49,7 @@ def problem() -> str:
 class Host:
     """A host with its own interfaces, name and directory of local sockets.
 
-    Files and processes are shared with all.
+    Files and processes are shared by all hosts.
     """
 
     def __init__(self, name: str, environment: Mapping[str, str], clock_ahead_s: float) -> None:
@@ -61,7 +61,7 @@ class Host:
             clock_ahead_s: How far its monotonic clock is ahead of this machine's, in whole seconds.
 
         Raises:
-            UnsupportedError: It can't be created.
+            UnsupportedError: The host can't be created.
         """
         self.name = name
         self.interfaces: list[str] = []
@@ -97,7 +97,7 @@ class Host:
             Its standard output.
 
         Raises:
-            UnsupportedError: It fails.
+            UnsupportedError: The program fails.
         """
         ended = subprocess.run(
             [*self.prefix, *arguments], input=said, capture_output=True, text=True, timeout=_WITHIN_S, check=False
@@ -107,11 +107,11 @@ class Host:
         return ended.stdout
 
     def ip(self, *lines: str) -> None:
-        """Run commands of ``ip``, given without that word."""
+        """Run commands of ``ip``, which are given without that word."""
         self.run("ip", "-batch", "-", said="\n".join(lines))
 
     def add_interface(self) -> str:
-        """Return the name of one more interface, which is yet to be created."""
+        """Return a name for another interface, which is yet to be created."""
         self.interfaces.append(f"eth{len(self.interfaces)}")
         return self.interfaces[-1]
 
@@ -137,11 +137,11 @@ class Host:
 
 
 class Segment:
-    """A switch, and the subnet of the hosts on it.
+    """A switch, and the subnet of its hosts.
 
     Args:
-        switch: Its own host.
-        subnet: Such as ``10.77.1.0/24``.
+        switch: A host of its own.
+        subnet: The subnet, such as ``10.77.1.0/24``.
     """
 
     def __init__(self, switch: Host, subnet: str) -> None:
@@ -156,7 +156,7 @@ class Segment:
         """Plug a host in; return its address on this segment.
 
         Raises:
-            UsageError: It is plugged in already.
+            UsageError: The host is already plugged in.
         """
         if host in self._ports:
             raise UsageError(f"host {host.name!r} is plugged in already")
@@ -174,7 +174,7 @@ class Segment:
         return address
 
     def cut(self, host: Host) -> None:
-        """Block everything from now on, without telling the host: as out of a radio's range."""
+        """Block everything from now on, as if out of radio range: the host is not notified."""
         self._switch.ip(f"link set {self._ports[host]} nomaster")
 
     def restore(self, host: Host) -> None:
@@ -219,7 +219,7 @@ class Lab:
         return host
 
     def segment(self, subnet: str) -> Segment:
-        """Create a switch; ``subnet`` is such as ``10.77.1.0/24``."""
+        """Create a switch with a subnet, such as ``10.77.1.0/24``."""
         return Segment(self.host("switch"), subnet)
 
     def enter(self, context: AbstractContextManager[_Entered]) -> _Entered:
@@ -227,7 +227,7 @@ class Lab:
         return self._stack.enter_context(context)
 
     def close(self) -> None:
-        """Take everything down, in the reverse order. Idempotent."""
+        """Take everything down in reverse order. Idempotent."""
         self._stack.close()
 
     def __enter__(self) -> Self:

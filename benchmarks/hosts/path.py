@@ -17,7 +17,7 @@ _numbers = itertools.count()
 
 
 class Path:
-    """A point-to-point link whose packets pass through an impairing process. Ends with the lab.
+    """A point-to-point link whose packets pass through a process that impairs them. Ends with the lab.
 
     The fate of the n-th packet each way is the same in each run with the same seed and rates.
 
@@ -25,7 +25,7 @@ class Path:
         lab: The lab of both hosts.
         first: One host.
         second: The other.
-        seed: Decides the fate of each packet.
+        seed: Determines the fate of each packet.
         impairments: The effects on packets, both ways; by default none.
     """
 
@@ -40,7 +40,7 @@ class Path:
         self._worker.answer(STARTS_WITHIN_S)
         self.first, self.second = f"10.78.{number}.1", f"10.78.{number}.2"  #: the hosts' addresses on this path
         for host, here, there in ((first, self.first, self.second), (second, self.second, self.first)):
-            # Otherwise the kernel's own packets, which search routers, would take part in the draws.
+            # Otherwise the kernel's own packets, which search for routers, would change the fate of the others.
             host.run("sh", "-c", f"echo 1 > /proc/sys/net/ipv6/conf/{name}/disable_ipv6")
             host.ip(
                 f"link set {name} txqueuelen {_QUEUE} up",
@@ -58,7 +58,7 @@ class Path:
         self._tell_relay(self.impairments)
 
     def cut(self) -> None:
-        """Block everything from now on, without telling the hosts."""
+        """Block everything from now on, without notifying the hosts."""
         there, back = self.impairments
         self._tell_relay((replace(there, loss=1.0), replace(back, loss=1.0)))
 

@@ -20,17 +20,17 @@ _IFF_TUN: Final = 0x0001
 _IFF_NO_PI: Final = 0x1000
 _CLONE_NEWNET: Final = 0x40000000
 _LARGEST: Final = 65536
-_AT_ONCE: Final = 32  # packets of one direction before the other gets a turn
+_AT_ONCE: Final = 32  # maximum number of packets in one direction before the other gets a turn
 _NICE: Final = -10  # a busy processor should not add to the requested delay
 
 
 class Direction(NamedTuple):
     """The traffic of one direction since the last report."""
 
-    packets: int  #: that arrived
-    size: int  #: bytes of those
-    lost: int  #: on purpose
-    late_ns: list[int]  #: excess delay of each, added by this process
+    packets: int  #: number of packets that arrived
+    size: int  #: total size of those [bytes]
+    lost: int  #: number of packets dropped on purpose
+    late_ns: list[int]  #: delay that this process added to each, beyond the intended one
 
 
 def device(pid: int, name: str) -> int:
@@ -52,14 +52,14 @@ def relay(
 ) -> None:
     """Relay packets until ``None`` arrives through the pipe.
 
-    Two :class:`Impairments` there, one each way, apply from then on, and are answered by ``"set"``; ``"tell"`` is
-    answered by two :class:`Direction`.
+    Two :class:`Impairments` received there, one each way, apply from then on, and are answered by ``"set"``; ``"tell"``
+    is answered by two :class:`Direction`.
 
     Args:
         pipe: To the measuring process.
-        seed: Decides the fate of each packet.
+        seed: Determines the fate of each packet.
         ends: A process of each host, and the name of the host's device.
-        impairments: At first, each way.
+        impairments: The initial ones, each way.
     """
     descriptors = [device(*end) for end in ends]
     ways = [_Wire(descriptors[0], descriptors[1], f"{seed}/0", impairments[0])]
@@ -114,7 +114,7 @@ class _Wire:
             due_ns, packet = found
             try:
                 os.write(self._sink, packet)
-            except OSError:  # the device is down: the packet is lost as on any path
+            except OSError:  # the device is down: the packet is lost, as on any path
                 continue
             self._size += len(packet)
             self._late_ns.append(now_ns - due_ns)

@@ -27,13 +27,13 @@ class Trace:
     """When packets can leave. It is repeated after its end.
 
     Raises:
-        UsageError: The times don't grow, or there are none.
+        UsageError: There are no times, or they are not in rising order.
     """
 
     name: str
     at_ms: tuple[int, ...]  #: at each, :data:`OPPORTUNITY` bytes may leave; unused ones are lost
-    queue: int = QUEUE  #: bytes
-    begin_ns: int = 0  #: when it begins, on the monotonic clock
+    queue: int = QUEUE  #: size of the queue [bytes]
+    begin_ns: int = 0  #: when the trace begins, on the monotonic clock
 
     def __post_init__(self) -> None:
         if not self.at_ms or self.at_ms[0] < 0 or self.at_ms[-1] <= 0:
@@ -52,18 +52,18 @@ class Trace:
         return self.begin_ns + (turn * self.length_ms + self.at_ms[index]) * _MS
 
     def first_after(self, now_ns: int) -> int:
-        """Return the index of the first opportunity at a time or later."""
+        """Return the index of the first opportunity at or after a time."""
         turn, ms = divmod(-(-(now_ns - self.begin_ns) // _MS), self.length_ms)
         if turn < 0:
             return 0
         return turn * len(self.at_ms) + bisect_left(self.at_ms, ms)
 
     def kbit(self, from_ms: float, to_ms: float) -> float:
-        """Return the capacity in a part of its length, excluding the end [kbit]."""
+        """Return the capacity in a part of the trace, excluding the end [kbit]."""
         return (bisect_left(self.at_ms, to_ms) - bisect_left(self.at_ms, from_ms)) * OPPORTUNITY * 8e-3
 
     def waits_ms(self, ms: float) -> float:
-        """Return how long nothing could leave, at a moment within its length."""
+        """Return how long nothing has been able to leave, at a moment within the trace."""
         index = bisect_right(self.at_ms, ms)
         return ms - (self.at_ms[index - 1] if index else 0)
 
@@ -106,7 +106,7 @@ def recorded(name: str) -> Trace | None:
     """Return a recorded uplink; None if missing: beside the checkout or in ``SKYLOOP_FIXTURES``.
 
     Raises:
-        FileFormatError: It is not a trace.
+        FileFormatError: The file is not a trace.
     """
     file = _FIXTURES / "mobile-network" / f"{name}.up.120s"
     if not file.is_file():
@@ -121,15 +121,15 @@ def recorded(name: str) -> Trace | None:
 def synthetic(seed: int = 1, length_s: int = 120, kbit_s: float = 2200.0) -> Trace:
     """Synthesise a trace like that of a phone in a car: its rate wanders, and sometimes nothing passes.
 
-    The logarithm of the rate follows an autoregressive process of one second (a standard deviation of 0.7), and once in
-    12 s on average nothing passes for 0.6 to 4 s, short times more often. Of the three recorded ones that is the
-    poorest, AT&T's: 1900 kbit/s on average, a tenth of the seconds below 300, eleven times of more than 250 ms in two
-    minutes in which nothing passes.
+    The logarithm of the rate follows an autoregressive process of one second (with a standard deviation of 0.7), and
+    once in 12 s on average, nothing passes for 0.6 to 4 s, usually for a short time. This resembles the poorest of the
+    three recorded traces, AT&T's: 1900 kbit/s on average, a tenth of the seconds below 300 kbit/s, and in two minutes
+    eleven gaps of more than 250 ms.
 
     Args:
-        seed: Decides everything.
-        length_s: Its length [s].
-        kbit_s: About the average while something passes.
+        seed: Determines everything.
+        length_s: Length of the trace [s].
+        kbit_s: Approximate average while something passes.
     """
     rng = random.Random(seed)
     level, budget, silent_ms, times = 0.0, 0.0, 0, []
@@ -149,10 +149,10 @@ def synthetic(seed: int = 1, length_s: int = 120, kbit_s: float = 2200.0) -> Tra
 
 
 def find(names: tuple[str, ...] = ()) -> list[Trace]:
-    """Return the traces of these names; without any, all recorded ones, or the synthetic one if there are none.
+    """Return the traces with these names or, without names, all recorded traces, or else the synthetic one.
 
     Raises:
-        UsageError: There is no such trace.
+        UsageError: No trace has this name.
     """
     found = []
     for name in names or RECORDED:

@@ -25,7 +25,7 @@ from skyloop.files import write as write_file
 
 LEAST_S: Final = 0.5
 
-#: Called with the share done, 0 to 1, and the next step.
+#: Called with the fraction done, 0 to 1, and the next step.
 Report = Callable[..., None]
 Seconds = Annotated[
     float | None, typer.Option(min=LEAST_S, help="Duration for each contender, case or size [default: 30]")
@@ -59,7 +59,7 @@ def parse_sizes(text: str | None) -> list[Size]:
 
 @contextmanager
 def measuring(what: str, output: Path | None) -> Iterator[Report]:
-    """Create the folder for the results, and show the progress on a terminal."""
+    """Create the folder for the results, and show progress on a terminal."""
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
     with Progress(transient=True, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
@@ -78,10 +78,10 @@ def finish(
     output: Path | None,
     draw: Callable[[Any, Path], list[Path]] | None = None,
 ) -> None:
-    """Print the tables, and write the results as JSON, with diagrams, to the folder if there is one.
+    """Print the tables and, if there is a folder, write the results to it as JSON, with diagrams.
 
     Raises:
-        MissingExtraError: matplotlib is not installed; the JSON is written all the same.
+        MissingExtraError: matplotlib is not installed; the JSON is written anyway.
     """
     for table in shown:
         console().print(table)
@@ -112,7 +112,7 @@ def print_skipped(skipped: Mapping[str, str]) -> None:
 
 
 def as_rich(found: Sequence[tables.Table], where: str) -> list[Table]:
-    """Return tables for the terminal; those without rows are left out."""
+    """Return tables for the terminal, without empty ones."""
     shown = []
     for one in found:
         if one.rows:

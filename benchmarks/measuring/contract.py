@@ -2,7 +2,7 @@
 
 A contender is a module with two classes, ``Vehicle(address, received)``, ``Application(address, received)``. The
 sender's stamp is taken when the data are ready and before the contender is called; ``received(channel, sent_ns)`` is
-called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
+called when the receiver's user has them (a frame as an array). Stamps travel with the samples.
 
 Interpreters with only NumPy and the contender import this module, so it imports nothing else.
 """
@@ -45,7 +45,7 @@ class ApplicationEnd(Protocol):
 
 
 class Recorder:
-    """Keeps the arrivals."""
+    """Records arrivals."""
 
     def __init__(self) -> None:
         self.arrivals: Arrivals = {}
@@ -96,7 +96,7 @@ def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
     Args:
         end: Sends them.
         turn: The schedule.
-        begin_ns: Start of counting, on the monotonic clock.
+        begin_ns: When counting begins, on the monotonic clock.
     """
 
     def publish_feedback() -> None:
@@ -112,7 +112,7 @@ def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
 
 
 def picture(size: Size) -> Image:
-    """Return noise, shape (height, width, 3), dtype uint8, which can't be compressed on the way."""
+    """Return noise, which can't be compressed on the way, shape (height, width, 3), dtype uint8."""
     return np.random.default_rng(1).integers(0, 255, (size.height, size.width, 3), np.uint8)
 
 

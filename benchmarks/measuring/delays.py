@@ -37,10 +37,10 @@ class Cell(msgspec.Struct, frozen=True):
 
 
 class Series(msgspec.Struct, frozen=True):
-    """Skyloop's individual delays, with frames of the first size; the data of the figures."""
+    """Skyloop's individual delays with frames of the first size, which the figures show."""
 
     channel: str
-    at_s: list[float]  #: since the beginning, without the turns of others
+    at_s: list[float]  #: since the beginning, excluding the turns of other contenders
     delay_us: list[float]
 
 
@@ -57,7 +57,7 @@ class Delays(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
     series: list[Series]
 
     def summary(self, contender: str, size: str, channel: str) -> Summary | None:
-        """Return the figures of one channel of one contender; None if not measured."""
+        """Return the figures of one channel of one contender; None if they were not measured."""
         for cell in self.cells:
             if (cell.contender, cell.size, cell.channel) == (contender, size, channel):
                 return cell.summary
@@ -74,14 +74,14 @@ def measure(
     """Measure Skyloop, the floor and other contenders in turns.
 
     Args:
-        seconds: Duration for each with each size of frames [s].
+        seconds: Duration for each contender with each frame size [s].
         sizes: Sizes of the frames.
         peers: Further contenders.
         skipped: Contenders that can't be measured, with reasons, for the results.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
-        LinkError: A contender's processes do not find each other, or nothing arrives.
+        LinkError: A contender's processes did not find each other, or nothing arrived.
     """
     machine = Machine.here()
     contenders = [FLOOR, OURS, *peers]
@@ -139,6 +139,6 @@ def load(path: Path) -> Delays:
     """Read ``delays.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Delays, "the results of benchmarks.peers", MAX_RESULTS)

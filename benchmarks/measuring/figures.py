@@ -29,7 +29,7 @@ _OTHERS: Final = {
 }
 _PAPER: Final = "#b8463d"
 _BINS: Final = 60
-_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; the number beyond is stated
+_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; the number of delays beyond it is stated
 _SETTINGS: Final[Any] = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -53,7 +53,7 @@ def draw(results: Delays, folder: Path) -> list[Path]:
 
 
 def paper_figures(results: Delays) -> dict[str, Figure]:
-    """Return the paper's figures 3, 4 and 5, by the names of their files."""
+    """Return the paper's figures 3, 4 and 5, keyed by file name."""
     series = {one.channel: one for one in results.series}
     return {
         "delays-command": distribution(series[COMMAND], f"Delay of commands, {_where(results)}"),
@@ -63,12 +63,12 @@ def paper_figures(results: Delays) -> dict[str, Figure]:
 
 
 def save(make: Callable[[], dict[str, Figure]], folder: Path, endings: Sequence[str] = ("png", "svg")) -> list[Path]:
-    """Create figures in the pages' style and write them by their names.
+    """Create figures in the pages' style and write them to files.
 
     Args:
-        make: Makes the figures, by their names.
+        make: Makes the figures, keyed by name.
         folder: The folder for the files.
-        endings: A file of each kind is written for each figure.
+        endings: File name endings; each figure is written once for each of them.
 
     Returns:
         The files.

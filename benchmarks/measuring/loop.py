@@ -51,7 +51,7 @@ class Trip(NamedTuple):
     applied: int
 
     def stages_ns(self) -> dict[str, int]:
-        """Return the duration of each stage, and of all together [ns]."""
+        """Return the duration of each stage, and the total [ns]."""
         stages = {name: self[number + 1] - self[number] for number, name in enumerate(STAGES)}
         return stages | {TOTAL: self.applied - self.captured}
 
@@ -78,10 +78,10 @@ def measure(seconds: float, sizes: Sequence[Size], progress: Progress = lambda _
     Args:
         seconds: Duration for each size [s].
         sizes: Sizes of the frames.
-        progress: Called with the share done, 0 to 1, and the next step.
+        progress: Called with the fraction done, 0 to 1, and the next step.
 
     Raises:
-        LinkError: Not one command was applied.
+        LinkError: No command was applied.
     """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
@@ -121,7 +121,7 @@ def _size_result(size: Size, trips: Sequence[Trip], sent: int) -> SizeResult:
 
 
 class Answering(Controller):
-    """Answers each frame with a command at once, which leaves only Skyloop's own share of the loop.
+    """Answers each frame with a command at once, so that only Skyloop's own part of the loop remains.
 
     Args:
         drone: The drone.
@@ -149,7 +149,7 @@ def control(pipe: Pipe, proxy: str) -> None:
     """
     pipe.send("ready")
     while (turn := pipe.recv()) is not None:
-        echoes: dict[int, tuple[int, int]] = {}  # by capture: sent, applied [ns]; later repeats change nothing
+        echoes: dict[int, tuple[int, int]] = {}  # by capture: sent, applied [ns]; repeats are ignored
 
         def applied(echo: Applied, echoes: dict[int, tuple[int, int]] = echoes) -> None:
             if type(echo.asked) is Velocity:
@@ -173,6 +173,6 @@ def load(path: Path) -> Loop:
     """Read ``loop.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Loop, "the results of benchmarks.loop", MAX_RESULTS)

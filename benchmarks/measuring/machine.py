@@ -8,11 +8,11 @@ from pathlib import Path
 
 
 def cpu_time_s(pid: int) -> float:
-    """Return the processor time used so far by a process, all threads, user and system [s]; 0 if it has ended."""
+    """Return the processor time used so far by a process, for all threads, user and system [s]; 0 if it has ended."""
     stat = _read(f"/proc/{pid}/stat")
     if not stat:
         return 0.0
-    fields = stat.rpartition(")")[2].split()  # the name before it may contain blanks
+    fields = stat.rpartition(")")[2].split()  # the name may contain spaces
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 

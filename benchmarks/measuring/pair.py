@@ -11,7 +11,7 @@ from benchmarks.measuring.contract import Arrivals, application_side, vehicle_si
 from benchmarks.measuring.schedule import CHANNELS, SETTLE_S, WARM_UP_S, Turn
 from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 
-_LATE_S: Final = 20.0  # for an answer on a busy machine
+_LATE_S: Final = 20.0  # time allowed for an answer on a busy machine
 _AHEAD_NS: Final = 50_000_000
 
 
@@ -19,10 +19,10 @@ class Pair:
     """The vehicle's and the application's process of one contender.
 
     Args:
-        workers: Starts the processes, and ends them.
+        workers: Starts and ends the processes.
         module: Holds the contender's ends; see :mod:`benchmarks.measuring.contract`.
         address: A separate folder for its sockets.
-        python: The interpreter that runs it.
+        python: The interpreter that runs the module.
         application_module: Holds the application's end, if that is another module.
         prefixes: Put before the interpreter, for the vehicle's side and the application's.
     """
@@ -52,14 +52,14 @@ class Pair:
             worker.answer(STARTS_WITHIN_S)
 
     def begin(self) -> int:
-        """Start the samples; return the start of counting [ns]."""
+        """Start the samples; return when counting begins [ns]."""
         begin_ns = time.monotonic_ns() + round(WARM_UP_S * 1e9) + _AHEAD_NS
         for worker in (self.vehicle, self.application):
             worker.pipe.send(begin_ns)
         return begin_ns
 
     def arrivals(self, turn: Turn, begin_ns: int) -> Arrivals:
-        """Wait for the turn's end, and return its samples that arrived."""
+        """Wait for the end of the turn, and return the samples that arrived."""
         found: Arrivals = {channel: [] for channel in CHANNELS}
         for worker in (self.application, self.vehicle):
             found |= worker.answer(turn.seconds + WARM_UP_S + SETTLE_S + _LATE_S)
@@ -72,5 +72,5 @@ class Pair:
 
 
 def since(arrivals: Arrivals, begin_ns: int) -> Arrivals:
-    """Return the arrivals without earlier ones."""
+    """Return the arrivals of samples sent at this time or later."""
     return {channel: [pair for pair in pairs if pair[0] >= begin_ns] for channel, pairs in arrivals.items()}

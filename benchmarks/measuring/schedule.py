@@ -15,14 +15,14 @@ CHANNELS: Final = (COMMAND, FEEDBACK, VIDEO)
 #: The periods of the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PACKET_PERIOD_S: Final = 0.03125
 FRAME_PERIOD_S: Final = 0.0667
-WARM_UP_S: Final = 0.4  #: at the start of a turn, not counted: threads, slots and discovery of a new connection
-SETTLE_S: Final = 0.3  #: for the last samples of a turn to arrive
-_GOLDEN: Final = 0.618034  # fractional parts of its multiples are spread evenly for any number of them
+WARM_UP_S: Final = 0.4  #: not counted at the start of a turn, because a connection must first be set up
+SETTLE_S: Final = 0.3  #: time for the last samples of a turn to arrive
+_GOLDEN: Final = 0.618034  # the fractional parts of any number of its multiples are spread evenly
 
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """The size of a raw frame with three bytes a pixel."""
+    """The size of a raw frame with three bytes per pixel."""
 
     width: int
     height: int
@@ -32,7 +32,7 @@ class Size:
 
     @property
     def frame_bytes(self) -> int:
-        """Bytes of a frame."""
+        """Size of a frame in bytes."""
         return self.width * self.height * 3
 
 
@@ -46,7 +46,7 @@ SIZES: Final = (SMALL, MIDDLE, LARGE)
 class Turn:
     """All three channels at once for ``seconds``, after the warm-up.
 
-    ``number`` shifts the channels against each other, so that they coincide in every way over several turns.
+    ``number`` shifts the channels against each other, so that over several turns they coincide in every way.
     """
 
     number: int
@@ -83,7 +83,7 @@ def paced(
     """Yield at each deadline; a late one does not shift the later ones.
 
     Args:
-        deadlines_ns: On the clock.
+        deadlines_ns: Times on the clock.
         clock: Returns the time [ns].
         sleep: Sleeps for a number of seconds.
     """
@@ -95,5 +95,5 @@ def paced(
 
 
 def sleep_until(at_ns: int) -> None:
-    """Sleep until a time on the monotonic clock; not at all if it has passed."""
+    """Sleep until a time on the monotonic clock; return at once if it has passed."""
     time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-SMALL_SHARE = 0.01  #: of the period: the paper counts the delays below it
+SMALL_SHARE = 0.01  #: fraction of the period; the paper counts the delays below it
 
 
 class Summary(msgspec.Struct, frozen=True):
     """A distribution of delays of samples sent periodically."""
 
     samples: int
-    lost: int  #: sent and never received
+    lost: int  #: sent but never received
     period_ms: float
     mean_us: float
     minimum_us: float
@@ -22,11 +22,11 @@ class Summary(msgspec.Struct, frozen=True):
     median_us: float
     p99_us: float
     p999_us: float
-    under_1_percent: float  #: share of the samples that took less than 1 % of the period, 0 to 1
+    under_1_percent: float  #: fraction of the samples that took less than 1 % of the period, 0 to 1
 
     @property
     def mean_of_period(self) -> float:
-        """The mean as a share of the period."""
+        """The mean as a fraction of the period."""
         return self.mean_us / 1e3 / self.period_ms
 
 
@@ -39,7 +39,7 @@ def summarize(delays_ns: Sequence[float], *, sent: int, period_s: float) -> Summ
         period_s: The channel's period [s].
 
     Raises:
-        ValueError: None arrived.
+        ValueError: No sample arrived.
     """
     values = _microseconds(delays_ns)
     median, p99, p999 = (float(value) for value in np.percentile(values, [50.0, 99.0, 99.9]))

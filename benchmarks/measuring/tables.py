@@ -1,4 +1,4 @@
-"""The results of the delays as tables, for the terminal and for the page."""
+"""The measured delays as tables, for the terminal and for the page."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _paper_column(found: Summary, paper_ms: float | None) -> list[str]:
 
 
 def comparison_table(results: Delays) -> Table:
-    """Return the medians of all contenders, with the ratio to the floor's."""
+    """Return the medians of all contenders, with their ratio to the floor's median."""
     rows = []
     for size in results.sizes:
         for name, title in results.contenders.items():
@@ -75,7 +75,7 @@ def comparison_table(results: Delays) -> Table:
 
 
 def loop_table(results: Loop) -> Table:
-    """Return the stages, each with all sizes."""
+    """Return a row for each stage, with all frame sizes."""
     rows = [
         [name, words, *(median_and_p99(size.stages[name]) for size in results.sizes)]
         for name, words in (*STAGES.items(), (TOTAL, "from the capture to the driver"))
@@ -88,7 +88,7 @@ def loop_table(results: Loop) -> Table:
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:
-    """Return the targets, and whether they were held."""
+    """Return the targets, and whether they were met."""
     rows = [
         [
             verdict.what,
@@ -109,7 +109,7 @@ def _against(summary: Summary | None, floor: Summary | None) -> str:
 
 
 def median_and_p99(summary: Summary | None) -> str:
-    """Return both as text in µs, the second in brackets."""
+    """Return both as text in µs, the second in parentheses."""
     return UNKNOWN if summary is None else f"{summary.median_us:.0f} ({summary.p99_us:.0f})"
 
 

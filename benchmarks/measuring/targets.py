@@ -9,13 +9,13 @@ from benchmarks.measuring.delays import Delays
 from benchmarks.measuring.schedule import COMMAND, FEEDBACK, LARGE, SMALL, VIDEO, Size
 from benchmarks.measuring.statistics import Summary
 
-#: Medians, Skyloop's to the floor's, at most; by size of the frames and channel.
+#: Maximum ratio of Skyloop's median to the floor's, by frame size and channel.
 FLOOR_MEDIAN: Final = {(SMALL, COMMAND): 1.4, (SMALL, FEEDBACK): 1.4, (SMALL, VIDEO): 1.4, (LARGE, VIDEO): 1.1}
-#: 99th percentiles, Skyloop's to the floor's, at most.
+#: Maximum ratio of Skyloop's 99th percentile to the floor's.
 FLOOR_P99: Final = {(SMALL, COMMAND): 2.0, (SMALL, FEEDBACK): 2.0, (SMALL, VIDEO): 2.0, (LARGE, VIDEO): 2.0}
-#: Medians, rclpy's to Skyloop's, at least.
+#: Minimum ratio of rclpy's median to Skyloop's.
 ROS_MEDIAN: Final = {(SMALL, COMMAND): 5.0, (SMALL, FEEDBACK): 5.0, (SMALL, VIDEO): 8.0, (LARGE, VIDEO): 30.0}
-#: Medians, ZeroMQ's to Skyloop's, at least.
+#: Minimum ratio of ZeroMQ's median to Skyloop's.
 ZEROMQ_MEDIAN: Final = {(SMALL, COMMAND): 1.0}
 
 
@@ -29,7 +29,7 @@ class Verdict(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """Whether the figure holds the target."""
+        """Whether the figure meets the target."""
         return self.figure >= self.limit if self.at_least else self.figure <= self.limit
 
 

@@ -11,7 +11,7 @@ from benchmarks.measuring.schedule import PACKET_PERIOD_S
 
 WAYPOINTS_M: Final = ((0.0, 0.0), (3.0, 0.0), (3.0, 3.0), (0.0, 3.0))
 SPEED_M_S: Final = 1.0
-GAIN_1_S: Final = 1.2  #: speed by distance
+GAIN_1_S: Final = 1.2  #: speed per distance
 REACHED_M: Final = 0.1
 
 

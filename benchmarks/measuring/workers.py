@@ -22,7 +22,7 @@ ENDS_WITHIN_S: Final = 5.0
 _WHAT_LENGTH: Final = 80
 #: The folders of ``benchmarks`` and ``skyloop``.
 _PACKAGES: Final = f"{Path(__file__).parents[2]}{os.pathsep}{Path(skyloop.__file__).parents[1]}"
-# At the end of the path: another interpreter's own packages, made for its version, come before ours.
+# At the end of the path, because another interpreter's own packages, built for its version, must come before ours.
 _BOOT: Final = (
     "import os, sys; sys.path += sys.argv[1].split(os.pathsep); "
     "from benchmarks.measuring.workers import child; child(sys.argv[2])"
@@ -44,7 +44,7 @@ class Worker:
         """Start the process.
 
         Args:
-            command: Starts the interpreter.
+            command: The command that starts the interpreter.
             work: A function of a module.
             arguments: Pickled and sent to the process.
         """
@@ -57,10 +57,10 @@ class Worker:
         self.pipe.send((work.__module__, work.__qualname__, arguments))
 
     def answer(self, timeout_s: float) -> Any:
-        """Return the next message of the process.
+        """Return the next message from the process.
 
         Args:
-            timeout_s: Longest wait for it [s].
+            timeout_s: Maximum wait [s].
 
         Raises:
             NoAnswerError: No message arrived in time.
@@ -104,7 +104,7 @@ class Workers:
             work: A function of a module.
             *arguments: Arguments of the function.
             python: The interpreter.
-            prefix: Put before the interpreter, for example to run it on another host.
+            prefix: Words put before the interpreter, for example to run it on another host.
         """
         worker = Worker([*prefix, python], work, arguments)
         self._running.append(worker)

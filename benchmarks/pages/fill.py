@@ -11,7 +11,7 @@ from skyloop.errors import UsageError
 def fill(page: str, blocks: Mapping[str, str], kind: str = "measured") -> str:
     """Return the page with these texts between ``<!-- measured: NAME -->`` and ``<!-- end -->``; other places stay.
 
-    ``kind`` stands before the name. Raises :class:`UsageError` for a text that the page has no place for.
+    ``kind`` replaces ``measured``. Raises :class:`UsageError` if the page has no place for a text.
     """
     placed: set[str] = set()
 

@@ -1,7 +1,7 @@
 """Put a flight of ``python -m benchmarks.paper`` into ``docs/paper.md``: ``python -m benchmarks.pages.paper FOLDER``.
 
-The page's tables are made from ``docs/measured/paper.json``: the flight's ``results.json`` without its single samples.
-Its pictures are those of the flight. Without a folder only the tables are made again.
+The page's tables are made from ``docs/measured/paper.json``, the flight's ``results.json`` without the single samples.
+Its pictures are those of the flight. Without a folder, only the tables are made again.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def paper(
     """Fly the paper's test flight on a simulated AR.Drone, record it, and make the paper's table and figures from it.
 
     It flies through waypoints by motion capture. The recording gives the paper's Table 1 and figures 3 to 5, with the
-    tracking error. The page flies too: take control there, and release it.
+    tracking error. You can fly from the page, too: take control there, and release it.
 
     Ctrl-C lands, and the figures then cover the flight up to that point.
     """
@@ -75,12 +75,12 @@ def paper(
     results = _evaluated(console, folder, machine, flight.load)
     console.print(f"report [bold]{folder / 'report.html'}[/], recording {RECORDING}, figures results.json")
     if results.tracking is None:
-        console.print("[bold red]it never started its path[/]")
+        console.print("[bold red]the drone never started its path[/]")
         raise typer.Exit(1)
 
 
 def _prepared(output: Path | None) -> Path:
-    """Create the folder; check before the flight whatever would otherwise fail after it."""
+    """Create the folder, and check before the flight what would otherwise fail after it."""
     from benchmarks.measuring.figures import check_installed as check_figures
     from skyloop.recording.recorder import check_installed as check_recording
 
@@ -131,7 +131,7 @@ class _Flight:
     _printed_s: float = field(default_factory=time.monotonic)
 
     def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> None:
-        """Fly it; ``port`` None: the default port of pages. Raises the errors of connecting, recording and take-off."""
+        """Fly, with the page on a port (None: the default). Raises the errors of connecting, recording and take-off."""
         from benchmarks.paper.flight import DelayLog, PaperFlight
         from skyloop.motion_capture import mocap
         from skyloop.recording import record
@@ -155,7 +155,7 @@ class _Flight:
             land(drone, self.console)
 
     def _follow(self, drone: Drone, flight: PaperFlight) -> None:
-        """Fly until the time is over, whoever else flies; a pilot that landed it must release it to restart it."""
+        """Fly until the time is over, whoever else flies; take off again once a pilot that landed it releases it."""
         began_s = time.monotonic()
         self.console.print(f"flying through waypoints for {self.seconds:g} s, or until Ctrl-C")
         with Progress(
@@ -189,14 +189,14 @@ class _Flight:
             self.console.print(words)
 
     def _stop(self) -> None:
-        """End the flight in good order on the first Ctrl-C."""
+        """End the flight normally on the first Ctrl-C."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
 
 
 def _put_down(drone: Drone) -> bool:
-    """Return whether it is ours to fly, and was landed by another application."""
+    """Return whether we may fly the drone and another application has landed it."""
     return drone.authority.state == "held" and not drone.feedback().state.airborne
 
 

@@ -27,27 +27,27 @@ from skyloop.recording.layout import Channel, FrameRecord
 from skyloop.recording.reader import Item, Progress, Recording
 
 Floats = NDArray[np.float64]
-RECORDER: Final = "recorder"  #: the name under which the recorder's own delays stand beside ours
+RECORDER: Final = "recorder"  #: the name of the recorder's own delays beside ours
 _PERIODS_S: Final = {COMMAND: PACKET_PERIOD_S, FEEDBACK: PACKET_PERIOD_S, VIDEO: FRAME_PERIOD_S}
 _CHANNELS: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.EVENTS, Channel.FRAMES, Channel.LOGS)
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """The accuracy along the path, by the truth [m], without the time in which others flew."""
+    """The true accuracy along the path [m], excluding the time in which others flew."""
 
     samples: int
-    rms_m: float  #: of the distance from the planned place at that time
+    rms_m: float  #: RMS distance from the planned position at that time
     largest_m: float
-    across_rms_m: float  #: of the distance to the nearest point of the round
+    across_rms_m: float  #: RMS distance to the nearest point of the round
     across_largest_m: float
-    waypoints: int  #: reached
+    waypoints: int  #: number of waypoints reached
 
 
 class Way(msgspec.Struct, frozen=True):
     """The path from above, and the error over time, for the diagrams."""
 
     at_s: list[float]  #: since the beginning
-    x: list[float]  #: the truth, world axes [m]
+    x: list[float]  #: true position, world axes [m]
     y: list[float]
     off_at_s: list[float]
     off_m: list[float]
@@ -56,19 +56,19 @@ class Way(msgspec.Struct, frozen=True):
 class Experiment(msgspec.Struct, frozen=True, tag_field="what", tag="paper"):
     """All figures of a run, as in ``results.json``."""
 
-    vehicle: str  #: its address
+    vehicle: str  #: the vehicle's address
     seconds: float  #: of the experiment, between the first and the last stamp
     delays: Delays  #: at the controller (named ``skyloop``) and at the recorder
     deviation_us: dict[str, float]  #: standard deviation of the controller's delays, by channel
-    tracking: Tracking | None  #: None: it never flew the path
+    tracking: Tracking | None  #: None if the drone never flew the path
     way: Way
     takeovers: int  #: number of takeovers by others
-    load: float | None = None  #: load average of its last minute
+    load: float | None = None  #: load average in the last minute
 
 
 @dataclass(slots=True)
 class DelaySamples:
-    """Samples of one channel: time of sending, delay and number of each."""
+    """The sending time, delay and number of each sample of one channel."""
 
     sent_ns: list[int] = field(default_factory=list)
     delay_ns: list[int] = field(default_factory=list)
@@ -81,7 +81,7 @@ class DelaySamples:
         self.seq.append(int(seq))
 
     def within(self, first_ns: int, last_ns: int) -> DelaySamples:
-        """Return the samples sent within a time [ns]."""
+        """Return the samples sent between two times [ns]."""
         found = DelaySamples()
         for row in zip(self.sent_ns, self.delay_ns, self.seq, strict=True):
             if first_ns <= row[0] <= last_ns:
@@ -112,12 +112,12 @@ def evaluate(
 
     Args:
         path: The recording.
-        machine: The machine that it ran on (default: this one).
-        load: The machine's load at its end.
+        machine: The machine that the experiment ran on (default: this one).
+        load: The machine's load at the end.
         progress: Called while the recording is read.
 
     Raises:
-        FileFormatError: It is no recording of the experiment, or lacks its application.
+        FileFormatError: The file is not a recording of the experiment, or lacks the application's log.
     """
     recording = Recording.open(path)
     known = recording.drone()
@@ -161,7 +161,7 @@ def load(path: Path) -> Experiment:
     """Read ``results.json``.
 
     Raises:
-        FileFormatError: It is not such a file.
+        FileFormatError: The file has another format.
     """
     return read_json(path, Experiment, "the results of the experiment", MAX_RESULTS)
 
@@ -222,9 +222,9 @@ def _cells(name: str, size: str, received: dict[str, DelaySamples]) -> list[Cell
 
 
 def numbered(seq: Sequence[int], channel: str) -> int:
-    """Return the number of samples sent, from their numbers.
+    """Return the number of samples sent, judging by their numbers.
 
-    Commands are only counted on arrival: their numbers also count packets that only keep the connection alive.
+    For commands, return the number that arrived, because their numbers also count keep-alive packets.
     """
     return len(seq) if channel == COMMAND else max(seq) - min(seq) + 1
 
@@ -262,7 +262,7 @@ def _track(found: _Gathered, first_ns: int, last_ns: int) -> tuple[Way, Tracking
 
 
 def distances_to_round(places: Floats) -> Floats:
-    """Return the distances from places to the closed line through the corners [m].
+    """Return the distances from positions to the closed line through the corners [m].
 
     Args:
         places: Shape (n, 3), in world axes [m].

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from skyloop.messages import Feedback
 
 FLUSH_S: Final = 1.0
-_LEG_S: Final = 4.0  # the fastest leg, which bounds the number of waypoints
+_LEG_S: Final = 4.0  # time for the fastest leg, which bounds the number of waypoints
 Row = tuple[int, int, int]
 
 
 class PaperFlight(Waypoints):
-    """Flies rounds through the corners for as long as it runs, and logs its planned place.
+    """Flies rounds through the corners for as long as it runs, and logs its planned position.
 
-    It pauses while others fly: when control returns, it flies back to its place on the path and continues.
+    It pauses while others fly; when control returns, it flies back to its position on the path and continues.
     """
 
     def __init__(self, drone: Drone, source: PositionSource, seconds: float) -> None:
@@ -47,17 +47,17 @@ class PaperFlight(Waypoints):
         rounds = int(seconds / _LEG_S / len(CORNERS)) + 1
         super().__init__(drone, CORNERS * rounds, speed_m_s=SPEED_M_S, hold_s=HOLD_S, source=self._keep)
         self.takeovers = 0
-        self.away = False  #: others fly, or it is on its way back from there
+        self.away = False  #: whether others fly, or it is on the way back to its path
         self._from = source
         self._fix: Fix | None = None
 
     @property
     def off_m(self) -> float | None:
-        """Distance from the planned place now [m]; None while it does not fly the path."""
+        """Distance from the planned position now [m]; None while it does not fly the path."""
         return None if self._law is None or self.away else self._law.off_m
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Fly on, or pause while others fly."""
+        """Continue to fly, or pause while others fly."""
         if self.drone.authority.state in ("preempted", "queued"):
             self.takeovers += not self.away
             self.away = True

@@ -7,10 +7,10 @@ from typing import Final
 from skyloop.messages import Vector
 
 APPLICATION: Final = "paper.application"  #: the application's number, as in echoes of commands
-#: Arrays, row by row: the proxy's time of publishing [ns, its clock], the delay until received [ns], and the number.
+#: Arrays, row by row: when the proxy published [ns, its clock], the delay until reception [ns], and the number.
 FEEDBACK_HEARD: Final = "paper.delays.feedback"
 VIDEO_HEARD: Final = "paper.delays.video"
-#: An array: x, y, z of its planned place at that time [m], and the number of waypoints reached before.
+#: An array: x, y, z of the planned position at that time [m], and the number of waypoints reached before.
 TARGET: Final = "paper.target"
 WAYPOINTS: Final = "waypoints"  #: name expected by the cockpit: rows of x, y, z
 

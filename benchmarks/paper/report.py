@@ -30,7 +30,7 @@ PICTURES: Final = {
 }
 #: The start and end of each delay.
 MEANING: Final = {
-    "command": "drone.velocity() has checked its numbers, and encodes → the driver has carried it out",
+    "command": "drone.velocity() has checked its numbers and starts encoding → the driver has applied the command",
     "feedback": "the proxy publishes what the driver reported → the controller's receiving thread has it",
     "video": "the proxy publishes the driver's picture → the controller's receiving thread has the array",
 }
@@ -43,7 +43,7 @@ def write(results: Experiment, folder: Path) -> Path:
         The page.
 
     Raises:
-        MissingExtraError: matplotlib is not installed; nothing is written then.
+        MissingExtraError: matplotlib is not installed; nothing is written.
     """
     save(lambda: figures(results), folder, ("png",))
     write_file(folder / "results.json", msgspec.json.format(msgspec.json.encode(results)))
@@ -53,12 +53,12 @@ def write(results: Experiment, folder: Path) -> Path:
 
 
 def figures(results: Experiment) -> dict[str, Figure]:
-    """Return the diagrams, by the names of their files."""
+    """Return the diagrams, keyed by file name."""
     return {**paper_figures(results.delays), "path": from_above(results)}
 
 
 def from_above(results: Experiment) -> Figure:
-    """Draw the flown path, by the truth, over the round of waypoints."""
+    """Draw the true path over the round of waypoints."""
     figure, axes = new_figure(5.4, 5.0)
     x, y, _ = np.array([*CORNERS, CORNERS[0]]).T
     axes.plot(results.way.x, results.way.y, color="#0b6e99", linewidth=0.8, alpha=0.8, label="flown, by the truth")

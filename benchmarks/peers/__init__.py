@@ -22,13 +22,13 @@ _LOOKS_WITHIN_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """Another library: its required imports, and the package whose version counts."""
+    """Another library: its required imports, and the package whose version is reported."""
 
     title: str
     imports: str
     package: str
     install: str
-    module: str = ""  #: with its two ends, if not in this package
+    module: str = ""  #: module with the two ends, if not in this package
 
 
 PEERS: Final = {
@@ -49,7 +49,7 @@ def chosen(text: str) -> list[str]:
     """Parse names of peers, separated by commas; ``all`` and ``none`` stand alone.
 
     Raises:
-        UnknownNameError: There is no such peer.
+        UnknownNameError: No peer has this name.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     if names == ["all"]:
@@ -63,11 +63,11 @@ def chosen(text: str) -> list[str]:
 
 
 def find(names: Iterable[str], ros_python: str | None = None) -> tuple[list[Contender], dict[str, str]]:
-    """Return the peers that can be measured here, and the reasons against the others.
+    """Return the peers that can be measured here, and why the others can't.
 
     Args:
         names: The peers' names.
-        ros_python: The interpreter with ``rclpy``; None: what the variable ``SKYLOOP_ROS_PYTHON`` names, or this one.
+        ros_python: The interpreter with ``rclpy``; None for that in ``SKYLOOP_ROS_PYTHON``, or this one.
     """
     found: list[Contender] = []
     skipped: dict[str, str] = {}
@@ -85,7 +85,7 @@ def find(names: Iterable[str], ros_python: str | None = None) -> tuple[list[Cont
 
 
 def _look(python: str, peer: Peer) -> tuple[str, str]:
-    """Return the version and the problem; one of the two is empty."""
+    """Return the version and the problem, one of which is empty."""
     code = f"import {peer.imports}; from importlib.metadata import version; print(version({peer.package!r}))"
     try:
         ended = subprocess.run(

@@ -1,4 +1,4 @@
-"""ROS 2 through rclpy: usual messages, "sensor data" quality of service, the default executor in a thread.
+"""ROS 2 through rclpy: standard messages, "sensor data" quality of service, the default executor in a thread.
 
 Runs under an interpreter with ``rclpy``, which need not be Skyloop's own.
 """
@@ -32,7 +32,7 @@ class _End:
     def __init__(self, name: str, address: str) -> None:
         os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         rclpy.init()
-        # A name space for this run alone: there may be other nodes on this host.
+        # A namespace for this run alone, because there may be other nodes on this host.
         self._node: Any = rclpy.create_node(name, namespace=Path(address).name.replace("-", "_"))
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)

@@ -75,7 +75,7 @@ class _End:
 
 
 class _Camera(MediaStreamTrack):  # type: ignore[misc]
-    """The newest picture, sent once each."""
+    """A track that sends each newest picture once."""
 
     kind = "video"
 
@@ -193,7 +193,7 @@ class Application(_End):
         while (found := self._pictures.get()) is not None:
             self._judge.look(found[1], found[0])
 
-    def command(self, sent_ns: int, setpoint: Setpoint) -> None:  # noqa: ARG002  (as many bytes as ours)
+    def command(self, sent_ns: int, setpoint: Setpoint) -> None:  # noqa: ARG002  (only its size matters, which equals ours)
         self._say(COMMAND, sent_ns, _COMMAND_BYTES)
 
     def close(self) -> None:

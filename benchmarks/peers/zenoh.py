@@ -1,4 +1,4 @@
-"""Eclipse Zenoh: two peers on the loopback interface, found without searching; callbacks on its own threads."""
+"""Eclipse Zenoh: two peers on the loopback interface, connected by address; callbacks on its own threads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.measuring.contract import Image, Received
 from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
 from benchmarks.measuring.waypoints import Setpoint
 
-_PACKET = struct.Struct("<q11d")  # stamp and as many numbers as feedback or a command has
+_PACKET = struct.Struct("<q11d")  # a stamp, and as many numbers as in feedback or a command
 _FRAME = struct.Struct("<qqq")  # stamp, columns, rows
 _PORTS = range(17_600, 17_700)
 
@@ -79,7 +79,7 @@ def _listen() -> tuple[Any, str]:
         try:
             return _open("listen", endpoint), endpoint
         except zenoh.ZError:
-            continue  # in use
+            continue  # the port is in use
     raise OSError(f"no port from {_PORTS[0]} to {_PORTS[-1]} is free on 127.0.0.1")
 
 

@@ -1,4 +1,4 @@
-"""ZeroMQ: publish and subscribe over its inter-process sockets, frames without copies where it can."""
+"""ZeroMQ: publish and subscribe over its inter-process sockets, frames without copies where possible."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from benchmarks.measuring.contract import Image, Received
 from benchmarks.measuring.schedule import COMMAND, FEEDBACK, VIDEO
 from benchmarks.measuring.waypoints import Setpoint
 
-_PACKET = struct.Struct("<q11d")  # stamp and as many numbers as feedback or a command has
+_PACKET = struct.Struct("<q11d")  # a stamp, and as many numbers as in feedback or a command
 _FRAME = struct.Struct("<qqq")  # stamp, columns, rows
-_KEPT = 2  # messages: the newest counts
+_KEPT = 2  # maximum number of queued messages, because only the newest counts
 
 
 class _End:

@@ -9,7 +9,7 @@ fuzzy control optimized by cross-entropy", FUZZ-IEEE 2012. Here the rules map th
 to the sideways speed.
 
 The rules are zero-order Takagi-Sugeno: each concludes a number, and the output is their mean, weighted by the rules'
-truth; a rule's truth is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of systems and its
+truth, the product of the truths of its conditions (Takagi and Sugeno, "Fuzzy identification of systems and its
 applications to modeling and control", IEEE Trans. SMC 15(1), 1985).
 """
 
@@ -108,7 +108,7 @@ class FuzzyController:
 
         Args:
             variables: Membership functions by variable and term.
-            rules: At least one.
+            rules: One rule or more.
 
         Raises:
             UsageError: There is no rule.
@@ -129,13 +129,13 @@ class FuzzyController:
         """Compute the output.
 
         Args:
-            **values: One for each variable.
+            **values: A value for each variable.
 
         Returns:
             The weighted mean of the rules' conclusions; 0 if no rule applies.
 
         Raises:
-            UsageError: A variable has no value, or it is NaN.
+            UsageError: A variable has no value, or its value is NaN.
         """
         missing = [name for name in self._variables if math.isnan(values.get(name, math.nan))]
         if missing:
@@ -181,7 +181,7 @@ class AvoidSettings:
     """Speeds and distances of :class:`AvoidLaw`."""
 
     speed_m_s: float = 0.6  #: forward speed
-    aside_m_s: float = 0.7  #: greatest sideways speed
+    aside_m_s: float = 0.7  #: maximum sideways speed
     close_rad: float = 0.9  #: apparent width of an obstacle at which the speed ahead is 0
     back_share: float = 0.25  #: fraction of the speed used to back off when blocked
     avoiding_rad: float = 0.15  #: obstacles with a larger apparent width are avoided
@@ -194,7 +194,7 @@ class AvoidLaw(VelocityLaw):
     """Computes velocities from sightings of obstacles. Pure: times are on the proxy's clock [ns].
 
     Attributes:
-        phase: As of the last step.
+        phase: The phase after the last step.
         ahead_m: Distance flown ahead, along the yaw at the start.
     """
 
@@ -221,7 +221,7 @@ class AvoidLaw(VelocityLaw):
 
         Args:
             seen: Obstacles, the widest first; empty if there are none. One with a NaN edge counts as close.
-            captured_ns: Capture of the frame.
+            captured_ns: Capture time of the frame [ns].
         """
         self._seen = [self._placed(one) for one in seen]
         for one in self._seen:
@@ -261,7 +261,7 @@ class AvoidLaw(VelocityLaw):
         return max(0.0, 1.0 - max(in_the_way, default=0.0) / self.settings.close_rad)
 
     def _aside(self, now_ns: int) -> float:
-        """Return the sum of the rules' outputs for all obstacles, or 0 if an unseen one blocks that side."""
+        """Return the sum of the rules' outputs for all obstacles, or 0 if one that left the image blocks that side."""
         aside = clamped(sum(self._rules.step(bearing=one.bearing_rad, width=one.width_rad) for one in self._seen), 1.0)
         side = math.copysign(1.0, aside)
         seen_ns = self._beside.get(side)

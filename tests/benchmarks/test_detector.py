@@ -51,7 +51,7 @@ def test_average_precision_of_known_rankings() -> None:
     assert average_precision([nothing]) == 0.0
 
 
-def test_places_answer_for_the_things_about_them() -> None:
+def test_places_are_assigned_the_objects_around_them() -> None:
     grid = places(64, 32)
     middles, strides = grid
     assert len(middles) == 8 * 4 + 4 * 2 + 2
@@ -68,7 +68,7 @@ def test_places_answer_for_the_things_about_them() -> None:
     assert (answer[~mine] == NOTHING).all()
 
 
-def test_a_smaller_thing_is_before_a_larger_one_and_what_need_not_be_found_takes_none_of_its_places() -> None:
+def test_a_smaller_object_takes_precedence_and_ignored_objects_take_none_of_its_places() -> None:
     grid = places(64, 32)
     boxes = np.array([[22, 14, 30, 30], [20, 12, 6, 8], [24, 16, 40, 30]], np.float32)
     answer, _ = assign(boxes, np.array([0, 2, IGNORED]), grid)
@@ -80,13 +80,13 @@ def test_a_smaller_thing_is_before_a_larger_one_and_what_need_not_be_found_takes
     assert (answer[alone >= 0] == alone[alone >= 0]).all()
 
 
-def test_large_things_are_of_coarse_grids() -> None:
+def test_large_objects_belong_to_coarse_grids() -> None:
     grid = places(320, 256)
     answer, _ = assign(np.array([[160, 128, 90, 230]], np.float32), np.array([0]), grid)
     assert set(grid[1][answer == 0].tolist()) == {32}
 
 
-def test_pictures_to_train_with_are_labelled_and_repeatable() -> None:
+def test_training_pictures_are_labelled_and_repeatable() -> None:
     first, again = (list(training_pictures(3, 4)) for _ in range(2))
     assert len(first) == 4
     for one, other in zip(first, again, strict=True):

@@ -34,7 +34,7 @@ SIZES = ["320×240", "1920×1080"]
 #: Median delays of the made-up results [µs], times 10 with the large frames.
 MEDIANS = {"floor": 50, "skyloop": 60, "ros2": 600}
 MACHINE = Machine("A processor", 2, "An OS", "Linux 6.1", "3.11.7", {}, 0.1)
-#: Cores in use that make the costs of one come out as round numbers.
+#: Cores in use that result in round unit costs.
 CPU = {
     Case(1, 0, video=False): {"proxies": 0.010, "pilot": 0.005},
     Case(1, OBSERVED, video=False): {"proxies": 0.010 + 0.0032, "observers": 0.032},
@@ -116,7 +116,7 @@ def test_the_papers_table(made_up: Delays) -> None:
     assert rows["the paper's mean"][2] == tables.UNKNOWN  # the paper measured no such frames
 
 
-def test_the_comparison_names_everybody(made_up: Delays) -> None:
+def test_the_comparison_names_every_contender(made_up: Delays) -> None:
     rows = tables.comparison_table(made_up).rows
     assert [row[1] for row in rows] == ["bare hand-over", "Skyloop", "ROS 2 (rclpy) 9.1"] * 2
     assert rows[1][2].endswith(" 1.2×")
@@ -131,7 +131,7 @@ def test_the_stages_of_a_trip() -> None:
 
 
 def slower(folder: Path, factor: float, contender: str, share: float = 1.0) -> Path:
-    """A run like the one on the page, with some of its figures multiplied."""
+    """Return the page's run with some of its figures multiplied."""
 
     def changed(cell: delays.Cell) -> delays.Cell:
         by = share * (factor if cell.contender == contender else 1.0)
@@ -153,7 +153,7 @@ def test_a_machine_that_is_slower_in_all_changes_nothing(tmp_path: Path) -> None
     assert not any(change.worse for change in changes)
 
 
-def test_a_loss_shows(tmp_path: Path) -> None:
+def test_a_regression_is_marked(tmp_path: Path) -> None:
     changes = compare.compare(slower(tmp_path, 1.3, "skyloop"), MEASURED)
     medians = [change for change in changes if change.what.endswith("median")]
     assert medians
@@ -169,7 +169,7 @@ def test_folders_with_nothing_in_common_and_damaged_files_are_errors(tmp_path: P
         compare.compare(tmp_path, MEASURED)
 
 
-def test_missed_and_needless_failsafes_are_told_apart() -> None:
+def test_missed_and_needless_failsafes_are_distinguished() -> None:
     expected = [Expected("one", 10 * S), Expected("two", 10 * S), Expected("one", 20 * S)]
     steps = [Step("one", 10 * S + S // 2), Step("one", 15 * S), Step("two", 9 * S), Step("one", 20 * S)]
     verdict = judge(expected, steps)
@@ -179,13 +179,13 @@ def test_missed_and_needless_failsafes_are_told_apart() -> None:
     assert judge([], []).delay is None
 
 
-def test_a_step_that_comes_too_late_is_none() -> None:
+def test_a_step_that_comes_too_late_does_not_count() -> None:
     verdict = judge([Expected("one", 0)], [Step("one", round(WITHIN_S * S) + 1)])
     assert (verdict.missed, verdict.needless) == (1, 1)
 
 
 @given(st.integers(1, 10), st.floats(1.0, 600.0))
-def test_users_stop_one_after_the_other_within_the_run(users: int, seconds: float) -> None:
+def test_users_stop_one_at_a_time_within_the_run(users: int, seconds: float) -> None:
     stops = stops_of(users, seconds)
     assert len(stops) == users
     assert stops == sorted(stops)
@@ -244,7 +244,7 @@ def test_a_channel_of_which_nothing_arrived_bends() -> None:
     assert scale_tables.scale_table(results, "proxies").rows[1][1] == "–"
 
 
-def test_the_series_are_told_apart() -> None:
+def test_the_series_are_distinguished() -> None:
     results = scale_of(*(case_of(case, {"proxies": 0.1}) for case in cases_of([1, 2, 5])))
     assert [(case.proxies, case.observers) for case in results.series("proxies")] == [(1, 1), (2, 2), (5, 5)]
     assert [(case.proxies, case.observers) for case in results.series("observers")] == [(1, 1), (1, 2), (1, 5), (1, 10)]

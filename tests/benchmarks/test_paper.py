@@ -88,7 +88,7 @@ def test_delays_and_path_are_those_of_a_flight(flown: Path) -> None:
 
 
 @pytest.mark.process
-def test_a_drone_that_was_put_down_takes_off_again_and_ctrl_c_ends_in_good_order(tmp_path: Path) -> None:
+def test_a_landed_drone_takes_off_again_and_ctrl_c_ends_normally(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs matplotlib: skyloop install bench")
     with Running("--minutes", "1", "--headless", "--output", str(tmp_path / "out"), command=PAPER) as demo:
         name = demo.until(r"is\s+up\s+as\s+(\S+)\s", 40)[1]
@@ -127,7 +127,7 @@ def test_lost_samples_are_counted_by_their_numbers() -> None:
 
 
 @pytest.mark.process
-def test_it_lets_go_while_somebody_else_flies_and_goes_on_when_given_back() -> None:
+def test_it_pauses_while_another_application_flies_and_resumes_afterwards() -> None:
     with skyloop.connect("sim://?vehicle=ardrone&position=1&cameras=none&speed=2") as drone:
 
         def where() -> Fix | None:

@@ -13,7 +13,7 @@ from tests.support.pages import rows, section
 PAGE = "docs/rotors.md"
 
 
-def test_a_second_order_response_goes_beyond_by_what_theory_says() -> None:
+def test_a_second_order_response_overshoots_as_in_theory() -> None:
     for one in rotors.IDENTIFIED:
         damping = -one.damping / (2 * math.sqrt(-one.stiffness))
         found = rotors.identified_step(one)

@@ -29,7 +29,7 @@ class Run(NamedTuple):
     options: str
     kind: type[msgspec.Struct]
     needs: str = "numpy"  #: packages
-    holds: Callable[[Any], bool] = bool  #: what shows that it did what it was to measure
+    holds: Callable[[Any], bool] = bool  #: what shows that it measured something
 
 
 RUNS = {

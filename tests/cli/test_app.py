@@ -33,7 +33,7 @@ def test_help_fits_the_terminal_and_shows_no_types(columns: int, monkeypatch: py
         assert [line for line in result.output.splitlines() if len(line) > columns or "<" in line] == [], words
 
 
-def test_the_list_of_commands_says_of_each_what_it_does_by_task() -> None:
+def test_the_list_of_commands_describes_each_by_task() -> None:
     result = runner.invoke(cli.build(), ["--help"], prog_name="skyloop")
     assert result.exit_code == 0
     titles = [line.removesuffix(":") for line in result.output.splitlines() if line[:1] != " " and line.endswith(":")]
@@ -45,7 +45,7 @@ def test_the_list_of_commands_says_of_each_what_it_does_by_task() -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> None:
+def test_every_example_uses_only_known_words(command: str) -> None:
     """Parse the words without calling the command."""
     import typer
 
@@ -59,7 +59,7 @@ def test_the_version_is_printed(run: Run) -> None:
     assert run("--version") == (0, f"skyloop {skyloop.__version__}\n", "")
 
 
-def test_without_a_word_help_is_shown(run: Run) -> None:
+def test_without_arguments_help_is_shown(run: Run) -> None:
     ended = run()
     assert ended == run("--help")
     assert (ended.code, ended.err) == (0, "")
@@ -82,7 +82,7 @@ def test_without_a_word_help_is_shown(run: Run) -> None:
         (["log", "inf"], "skyloop log: no command inf; did you mean 'info'?"),
     ],
 )
-def test_a_wrong_word_ends_with_2_and_says_what_would_be_right(run: Run, words: list[str], said: str) -> None:
+def test_an_unknown_word_exits_with_2_and_gets_a_suggestion(run: Run, words: list[str], said: str) -> None:
     ended = run(*words)
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err
@@ -108,7 +108,7 @@ def test_errors_are_one_line_and_an_exit_code(
     assert run("list") == (code, "", f"skyloop: {error}\n")
 
 
-def test_ctrl_c_ends_with_what_shells_expect(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_exits_with_the_status_that_shells_expect(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted() -> None:
         raise KeyboardInterrupt
 
@@ -116,7 +116,7 @@ def test_ctrl_c_ends_with_what_shells_expect(run: Run, monkeypatch: pytest.Monke
     assert run("list").code == 130
 
 
-def test_ctrl_c_while_the_commands_are_imported_is_no_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_the_commands_are_imported_shows_no_traceback(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(names: object) -> None:
         raise KeyboardInterrupt
 

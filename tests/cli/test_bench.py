@@ -99,7 +99,7 @@ def test_a_command_carries_its_time_to_the_last_bit(sent_ns: int, later_ns: int)
     assert bench.stamp_of(up, sent_ns + later_ns) == sent_ns
 
 
-def test_a_channel_without_samples_is_no_figure() -> None:
+def test_a_channel_without_samples_has_no_figure() -> None:
     with pytest.raises(ValueError, match="not one sample"):
         spread([])
 

@@ -45,7 +45,7 @@ def file(tmp_path: Path) -> Path:
     return write(tmp_path / "my.onnx", {"output0": output}, metadata={"names": "{0: 'person', 1: 'car', 2: 'box'}"})
 
 
-def test_what_was_detected_becomes_a_result_and_is_drawn() -> None:
+def test_detections_become_results_and_are_drawn() -> None:
     found = [Detection((1.0, 2.0, 3.0, 4.0), 0.9, 1, "car"), Detection((5.0, 6.0, 7.0, 8.0), 0.8, 0, "person")]
 
     class Detector:
@@ -68,7 +68,7 @@ def test_what_was_detected_becomes_a_result_and_is_drawn() -> None:
     assert text == Text("car 0.90", (1.0, 2.0))
 
 
-def test_what_cannot_be_is_told(run: Run, file: Path) -> None:
+def test_impossible_arguments_are_reported(run: Run, file: Path) -> None:
     for arguments, words in [
         (("nowhere.onnx", "--on", "alpha"), "there is no file nowhere.onnx"),
         ((str(file), "--on", "alpha", "--classes", "cra"), "did you mean 'car'"),

@@ -78,7 +78,7 @@ def test_several_missing_modules_are_listed_as_in_a_sentence(monkeypatch: pytest
     assert finding.detail == "none1, none2 and none3 not installed"
 
 
-def test_a_check_without_its_optional_part_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_without_its_optional_part_is_not_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def cameras() -> Iterator[Finding]:
         raise MissingExtraError("video://", "video", cause="No module named 'av'")
         yield

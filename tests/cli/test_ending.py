@@ -116,7 +116,7 @@ def test_no_drone_found_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -
         assert ended.err.startswith("skyloop: no drone found")
 
 
-def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_asks_for_confirmation(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:
     assert FAST_SIM
     assert alpha.pid
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)

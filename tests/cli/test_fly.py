@@ -165,7 +165,7 @@ def test_a_controller_of_frames_needs_a_camera(run: Run, alpha: Process, write: 
 
 
 @pytest.mark.process
-def test_a_recording_serves_a_controller_that_only_looks(run: Run, write: Write) -> None:
+def test_a_recording_suffices_for_a_controller_that_only_watches(run: Run, write: Write) -> None:
     video = f"video://{recorded('ardrone2/video-8s.pave')}"
     ended = run("fly", write(LOOKING), "--drone", video, "--seconds", "20")
     assert ended.code == 0, ended.err
@@ -226,7 +226,7 @@ def test_a_controller_that_forgets_its_base_is_refused() -> None:
         make(Forgetful, Stranger())  # type: ignore[arg-type]
 
 
-def test_what_failed_without_a_line_of_the_user_is_one_line_or_told_in_full() -> None:
+def test_errors_outside_the_users_code_are_shown_in_one_line_or_in_full() -> None:
     with pytest.raises(UsageError) as refused:
         parse_uri("nonsense")
     refused.value.__traceback__ = refused.tb.tb_next
@@ -237,7 +237,7 @@ def test_what_failed_without_a_line_of_the_user_is_one_line_or_told_in_full() ->
     assert "skyloop/drivers/uri.py" in what_failed(broken.value)
 
 
-def test_what_failed_because_of_another_error_shows_both_without_skyloops_lines() -> None:
+def test_chained_errors_are_both_shown_without_skyloops_lines() -> None:
     try:
         try:
             parse_uri("nonsense")
@@ -250,8 +250,8 @@ def test_what_failed_because_of_another_error_shows_both_without_skyloops_lines(
     assert "skyloop/drivers" not in text
 
 
-def test_what_failed_begins_with_the_line_of_the_user() -> None:
-    """Their own line comes first, not one of the library they called, nor of the loop that called them."""
+def test_errors_begin_with_the_line_in_the_users_code() -> None:
+    """The user's line comes first, not a line of the library they called, or of the loop that called them."""
 
     def on_frame() -> object:
         return json.loads("{")

@@ -41,7 +41,7 @@ def test_errors_are_reported_before_connecting(run: Run, words: tuple[str, ...],
     assert len(ended.err.splitlines()) == 1
 
 
-def test_a_wrong_class_of_a_file_is_told_with_what_it_may_have_been(run: Run) -> None:
+def test_an_unknown_class_in_a_file_gets_suggestions(run: Run) -> None:
     pytest.importorskip("onnxruntime")
     from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
@@ -123,7 +123,7 @@ def away_m(feedback: Feedback) -> float:
 
 @pytest.mark.process
 @pytest.mark.flight
-def test_a_processor_that_runs_finds_whom_it_follows(start: Callable[..., Process], tmp_path: Path) -> None:
+def test_a_running_processor_finds_the_target_to_follow(start: Callable[..., Process], tmp_path: Path) -> None:
     world = tmp_path / "walker.toml"
     world.write_text(WALKER)
     start("proxy", f"sim://?world={world}&cameras=front&fps=15&wind=0", "--name", "epsilon").until("ready")

@@ -54,7 +54,7 @@ def test_several_parts_are_installed_into_this_environment_each_requirement_once
     assert "--force-reinstall" in calls[1]
 
 
-def test_what_it_consists_of_can_be_seen_before(run: Run) -> None:
+def test_the_requirements_can_be_listed_first(run: Run) -> None:
     ended = run("install", "--dry-run", "metrics", "parquet")
     assert ended.out.splitlines() == [*EXTRAS["metrics"], *EXTRAS["parquet"]]
 
@@ -115,7 +115,7 @@ def test_all_missing_parts_are_named_at_once(
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
-def test_a_library_that_no_module_looked_for_is_brought_by_a_part_too(
+def test_libraries_that_no_module_imports_are_also_installed_with_a_part(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """``skyloop keys show`` ended with a traceback without cryptography."""

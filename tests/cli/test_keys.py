@@ -88,9 +88,7 @@ def test_keys_that_expire_within_a_week_are_listed(run: Run, tmp_path: Path) -> 
         (["revoke", "jane"], "no key named 'jane'"),
     ],
 )
-def test_wrong_words_end_with_2_and_say_what_would_be_right(
-    run: Run, folder: Path, words: list[str], said: str
-) -> None:
+def test_unknown_words_exit_with_2_and_get_a_suggestion(run: Run, folder: Path, words: list[str], said: str) -> None:
     ended = run("keys", *words, "--dir", str(folder))
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err

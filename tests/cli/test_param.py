@@ -37,7 +37,7 @@ TEXT = Parameter("a.mode", ParameterType.TEXT, "near", choices=("near", "far"))
         (TEXT, " as it is ", " as it is "),
     ],
 )
-def test_what_is_typed_becomes_a_value_of_the_parameters_type(parameter: Parameter, text: str, value: Value) -> None:
+def test_typed_text_becomes_a_value_of_the_parameters_type(parameter: Parameter, text: str, value: Value) -> None:
     parsed = parse_value(parameter, text)
     assert parsed == value
     assert type(parsed) is type(value)
@@ -52,7 +52,7 @@ def test_what_is_typed_becomes_a_value_of_the_parameters_type(parameter: Paramet
         (VECTOR, "1,x", "numbers such as"),
     ],
 )
-def test_what_can_not_be_one_is_answered_with_what_could(parameter: Parameter, text: str, kind: str) -> None:
+def test_invalid_text_is_answered_with_the_expected_kind(parameter: Parameter, text: str, kind: str) -> None:
     with pytest.raises(UsageError, match=f"{parameter.name} takes {kind}.*not '{text}'"):
         parse_value(parameter, text)
 
@@ -79,7 +79,7 @@ def test_allowed_values_are_described_in_words(parameter: Parameter, words: str)
     assert allowed(parameter) == words
 
 
-def test_several_are_a_table_and_one_is_told_in_full() -> None:
+def test_several_are_a_table_and_one_is_shown_in_full() -> None:
     assert table([FLOAT, BOOL]) == [
         "PARAMETER    VALUE    ALLOWED",
         "limits.tilt  0.2 rad  0.02 to 0.6",
@@ -143,7 +143,7 @@ def test_errors_are_reported_in_one_line(run: Run, alpha: Process, words: list[s
 
 
 @pytest.mark.process
-def test_writing_while_somebody_flies_says_who_and_what_to_do(run: Run, alpha: Process) -> None:
+def test_writing_while_another_pilot_flies_says_who_and_what_to_do(run: Run, alpha: Process) -> None:
     with skyloop.connect("alpha", name="the pilot"):
         ended = run("param", "alpha", "limits.tilt", "0.2")
         assert ended.code == 1

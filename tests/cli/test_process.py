@@ -54,7 +54,9 @@ def test_the_help_shows_how(run: Run) -> None:
         (("{file}", "--drone", "sim://", "--workers", "2"), "several workers need one proxy"),
     ],
 )
-def test_what_cannot_be_is_told(run: Run, file: Path, bravo: str, arguments: tuple[str, ...], words: str) -> None:
+def test_impossible_arguments_are_reported(
+    run: Run, file: Path, bravo: str, arguments: tuple[str, ...], words: str
+) -> None:
     ended = run("process", *(one.format(file=file) for one in arguments))
     assert ended.code == 2
     assert words in ended.err

@@ -156,7 +156,7 @@ def test_names_of_drones_parameters_and_files_complete(tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("columns", [40, 60])
-def test_what_tells_rows_apart_is_whole_in_narrow_terminals(columns: int) -> None:
+def test_distinguishing_columns_are_complete_in_narrow_terminals(columns: int) -> None:
     names = [f"alpha/video/front_{letter * 20}" for letter in "ab"]
     table = Table(named("topic"), "count", "a long heading", "another one", box=None)
     for name in names:

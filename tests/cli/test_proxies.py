@@ -114,7 +114,7 @@ def test_watching_for_programs_is_an_object_a_line(run: Run, alpha: Process) -> 
     assert "command" in first["stats"]
 
 
-def test_watching_shows_events_as_they_come(start: Callable[..., Process], alpha: Process) -> None:
+def test_watching_shows_events_as_they_arrive(start: Callable[..., Process], alpha: Process) -> None:
     process = start("watch", "alpha")
     process.until("pilot nobody")
     with skyloop.connect("alpha", name="the pilot"):
@@ -124,14 +124,14 @@ def test_watching_shows_events_as_they_come(start: Callable[..., Process], alpha
     assert "Traceback" not in process.text
 
 
-def test_watching_in_a_terminal_is_a_picture(alpha: Process) -> None:
+def test_watching_in_a_terminal_shows_a_live_screen(alpha: Process) -> None:
     text = in_terminal("watch", "alpha", "--seconds", "0.5", columns=80)
     for words in ("alpha", "roll, pitch, yaw", "link to vehicle", "delay median", "feedback"):
         assert words in text
 
 
 @pytest.mark.parametrize("width", [48, 80])
-def test_what_is_watched_in_a_narrow_terminal_keeps_its_words_and_figures_whole(alpha: Process, width: int) -> None:
+def test_watching_in_a_narrow_terminal_breaks_no_words_or_figures(alpha: Process, width: int) -> None:
     text = in_terminal("watch", "alpha", "--seconds", "0.5", columns=width)
     lines = [line for line in text.splitlines() if "velocity" in line]
     assert lines
@@ -140,7 +140,7 @@ def test_what_is_watched_in_a_narrow_terminal_keeps_its_words_and_figures_whole(
         assert words in text
 
 
-def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:
+def test_a_reader_that_closes_the_pipe_is_not_an_error(alpha: Process) -> None:
     watching = f"{sys.executable} -m skyloop watch alpha --seconds 3 | head -n 1"
     done = subprocess.run(["sh", "-c", watching], capture_output=True, text=True, timeout=20, check=True)
     assert "landed" in done.stdout
@@ -162,7 +162,7 @@ def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:
         (["sim://?world=rom&cameras=none", "--name", "free"], "no world named 'rom'; did you mean 'room'?"),
     ],
 )
-def test_a_proxy_that_can_not_be_says_why_in_one_line(
+def test_a_proxy_that_cannot_start_says_why_in_one_line(
     run: Run, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
 ) -> None:
     monkeypatch.setattr("skyloop.cli.network.settle", lambda options: None)
@@ -185,7 +185,7 @@ def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch:
 
 
 @pytest.mark.parametrize(("cameras", "cores"), [("front", "1"), ("none", "OpenCV is not imported")])
-def test_it_does_so_by_the_lock_and_by_opencv(cameras: str, cores: str) -> None:
+def test_it_yields_the_interpreter_lock_and_limits_opencvs_threads(cameras: str, cores: str) -> None:
     code = (
         "import sys; from skyloop.cli.network import settle; from skyloop.vehicles.sim.options import options_of;"
         "from skyloop.drivers.uri import parse_uri;"
@@ -239,7 +239,7 @@ def test_a_name_that_is_taken_ends_the_others_too(run: Run, start: Callable[...,
         (["--name", "Bad"], "'Bad' cannot be the name of a proxy"),
     ],
 )
-def test_a_simulation_that_can_not_be_says_why_in_one_line(run: Run, words: list[str], said: str) -> None:
+def test_a_simulation_that_cannot_start_says_why_in_one_line(run: Run, words: list[str], said: str) -> None:
     ended = run("sim", "--option", "cameras=none", *words)
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err

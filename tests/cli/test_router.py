@@ -44,7 +44,7 @@ def test_options_of_the_network_need_the_network(run: Run, option: tuple[str, ..
         assert f"{option[0]} is for the network: give --network multicast as well" in ended.err
 
 
-def test_firmware_is_no_proxy(run: Run) -> None:
+def test_firmware_is_not_a_proxy(run: Run) -> None:
     ended = run("sim", "--firmware", "ardrone2", "--network")
     assert ended.code == 2
     assert "--bind ADDRESS" in ended.err

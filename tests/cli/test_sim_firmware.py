@@ -22,7 +22,7 @@ pytest.importorskip("av")
 
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_says_where_it_listens_and_ends_when_told(start: Callable[..., Process], number: signal.Signals) -> None:
+def test_it_says_where_it_listens_and_ends_on_request(start: Callable[..., Process], number: signal.Signals) -> None:
     process = start(
         *("sim", "--firmware", "ardrone2", "--drones", "2", "--world", "empty", "--port-base", "0"),
         *("--lose", "0.05", "--delay", "0.001", "--repeat", "0.05", "--reorder", "0.05", "--fault-seed", "7"),
@@ -125,7 +125,7 @@ def test_the_autopilots_ports() -> None:
 
 
 @pytest.mark.process
-def test_several_autopilots_say_where_they_are_and_end_when_told(start: Callable[..., Process]) -> None:
+def test_several_autopilots_say_where_they_are_and_end_on_request(start: Callable[..., Process]) -> None:
     process = start("sim", "--firmware", "px4", "--drones", "2", "--world", "empty", "--port-base", "0")
     process.until("drone 1, system 2", 20.0)
     assert re.search(r"ready px4 drone 0, system 1, from udp \d+: mavlink://udpin:127.0.0.1:\d+\n", process.text)

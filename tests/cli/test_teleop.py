@@ -67,7 +67,7 @@ class Fingers:
         return wanted
 
 
-def test_a_press_moves_its_stick_for_a_while_and_repeats_keep_it() -> None:
+def test_a_press_moves_its_stick_for_a_while_and_repeats_hold_it() -> None:
     fingers = Fingers()
     assert fingers.press("w") == [FORWARD]
     assert fingers.press("left", after_s=0.2) == [Deflection(forward=1, yaw_rate=1)]
@@ -80,14 +80,14 @@ def test_a_press_moves_its_stick_for_a_while_and_repeats_keep_it() -> None:
     assert fingers.press("W", "x", "[") == [FORWARD]
 
 
-def test_sticks_do_nothing_on_the_ground_and_what_was_not_moved_is_not_let_go() -> None:
+def test_sticks_do_nothing_on_the_ground_and_unmoved_sticks_are_not_released() -> None:
     fingers = Fingers()
     assert fingers.press("w", state=LANDED) == ["grounded"]
     assert fingers.press(after_s=1.0, state=LANDED) == []
 
 
 @pytest.mark.parametrize("key", ["h", "H", " ", "t", "l", "esc", "alt"])
-def test_an_order_to_stop_lets_all_sticks_go(key: str) -> None:
+def test_a_stop_releases_all_sticks(key: str) -> None:
     fingers = Fingers()
     fingers.press("w")
     (order,) = fingers.press(key)
@@ -176,7 +176,7 @@ def test_esc_held_just_past_its_first_repeat_is_one_press_once_the_keyboard_is_k
 
 
 @pytest.mark.parametrize("delay_s", [0.25, 0.5])
-def test_esc_pressed_again_and_again_at_the_keyboards_own_pace_stops_the_motors(delay_s: float) -> None:
+def test_esc_pressed_repeatedly_at_the_keyboards_own_pace_stops_the_motors(delay_s: float) -> None:
     """Each second press was taken for a repeat of the first, however often Esc was pressed."""
     fingers = Fingers()
     fingers.press("w")
@@ -199,7 +199,7 @@ def test_repeats_that_were_held_up_behind_the_first_one_stop_no_motors() -> None
 
 
 @pytest.mark.parametrize("gap_s", [0.5, 0.9])
-def test_who_goes_on_pressing_esc_stops_the_motors_whatever_the_keyboards_delay(gap_s: float) -> None:
+def test_repeated_presses_of_esc_stop_the_motors_whatever_the_keyboards_delay(gap_s: float) -> None:
     """Presses in the rhythm of the keyboard's delay were each taken for its first repeat, and nothing stopped."""
     fingers = Fingers()
     fingers.hold("w", 0.3)
@@ -211,7 +211,7 @@ def test_who_goes_on_pressing_esc_stops_the_motors_whatever_the_keyboards_delay(
 
 
 @pytest.mark.parametrize("between", ["w", "alt", "h", "up", "x"])
-def test_esc_with_another_key_between_is_no_second_press(between: str) -> None:
+def test_esc_with_another_key_between_is_not_a_second_press(between: str) -> None:
     fingers = Fingers()
     fingers.press("esc")
     fingers.press(between, after_s=0.3)
@@ -220,7 +220,7 @@ def test_esc_with_another_key_between_is_no_second_press(between: str) -> None:
     assert "hover" in wanted
 
 
-def test_nothing_takes_the_place_of_a_stop_that_is_not_shown_yet() -> None:
+def test_nothing_replaces_a_stop_that_is_not_shown_yet() -> None:
     fingers = Fingers()
     fingers.press("esc", "esc")
     assert fingers.press("l", "w", "h", "t") == ["stop"]
@@ -243,7 +243,7 @@ def test_motors_are_cut_only_by_two_presses_of_esc(presses: list[tuple[str, floa
     assert "centre" in fingers.wait(1.0) or not any(fingers.wait(1.0))
 
 
-def test_each_key_that_is_told_does_something() -> None:
+def test_each_listed_key_does_something() -> None:
     told = {"↑": "up", "↓": "down", "←": "left", "→": "right", "−": "-", "Space": " ", "Esc": "esc"}
     keys = {told.get(word, word.lower()) for keys, _ in KEY_MAP for word in keys.replace(",", " ").split()}
     assert keys == {*STICKS, *ORDERS, "esc"}
@@ -269,7 +269,7 @@ def test_each_key_that_is_told_does_something() -> None:
         (b"\x1b[" + b"1" * 60, None, None),
     ],
 )
-def test_sequences_are_told_from_esc_and_from_letters(
+def test_escape_sequences_are_distinguished_from_esc_and_letters(
     data: bytes, keys: list[str] | None, flushed: list[str] | None
 ) -> None:
     """Ctrl with an arrow ends in a letter, and Alt with a letter begins with Esc: neither counts as either key."""
@@ -284,7 +284,7 @@ def test_sequences_are_told_from_esc_and_from_letters(
     assert "esc" not in found or b"\x1b\x1b" in data
 
 
-def test_an_arrow_that_comes_slowly_is_an_arrow() -> None:
+def test_a_slowly_arriving_arrow_sequence_is_an_arrow() -> None:
     tokens = Tokenizer()
     assert tokens.feed(b"\x1b") == []
     assert tokens.feed(b"[") == []
@@ -332,7 +332,7 @@ def test_a_key_that_does_nothing_says_so() -> None:
 
 
 @given(st.lists(st.binary(max_size=60), max_size=5))
-def test_whatever_a_terminal_sends_is_keys(parts: list[bytes]) -> None:
+def test_any_terminal_input_is_parsed_as_keys(parts: list[bytes]) -> None:
     tokens, hands = Tokenizer(), Hands()
     for at, data in enumerate(parts):
         keys = tokens.feed(data) + (tokens.flush() if tokens.waits else [])
@@ -350,7 +350,7 @@ def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     os.close(person)
 
 
-def test_ctrl_z_and_ctrl_s_are_keys_and_what_a_shell_makes_of_the_terminal_is_undone(line: tuple[int, int]) -> None:
+def test_ctrl_z_and_ctrl_s_are_keys_and_the_shells_terminal_settings_are_undone(line: tuple[int, int]) -> None:
     person, program = line
     before = termios.tcgetattr(program)
     with Keyboard() as keyboard:
@@ -389,7 +389,7 @@ def test_a_hover_ends_a_take_off_that_does_not_show_yet(proxy: ScriptedProxy) ->
         assert not proxy.until_commanded(Hover()).automatic
 
 
-def test_an_emergency_stop_is_heard_while_control_is_asked_for_or_given_back(
+def test_an_emergency_stop_is_handled_while_control_is_requested_or_released(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """C waited for the proxy's answer for up to 7 s, R for 2 s, and no key was read meanwhile."""
@@ -407,7 +407,7 @@ def test_an_emergency_stop_is_heard_while_control_is_asked_for_or_given_back(
         assert pilot._message == "release"
 
 
-def test_what_the_hands_ask_for_is_flown(proxy: ScriptedProxy) -> None:
+def test_the_pressed_keys_are_flown(proxy: ScriptedProxy) -> None:
     with flown(proxy) as drone:
         drone.wait("flying", WAIT_S)
         pilot = Teleop(drone, 0.5, 0.8)

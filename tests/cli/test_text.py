@@ -20,7 +20,7 @@ def a_usual_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm-256color")
 
 
-def test_what_matters_is_coloured_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_important_words_are_coloured_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     assert coloured("skyloop: no file", Terminal()) == "\x1b[31mskyloop: \x1b[0mno file"
     assert coloured("note: it never took off", Terminal()) == "\x1b[33mnote: \x1b[0mit never took off"
     assert coloured("landing", Terminal()) == "landing"

@@ -43,7 +43,7 @@ def test_a_file_of_rerun_for_a_time(run: Run, alpha: Process, tmp_path: Path, mo
     assert streams[0].of("world/drones/alpha", "Transform3D")
 
 
-def test_parameters_are_written_under_a_lease_that_is_held_for_that_moment(alpha: Process) -> None:
+def test_parameters_are_written_under_a_briefly_held_lease(alpha: Process) -> None:
     with skyloop.connect("alpha", access="observe") as observer:
         desk = ParameterAccess([observer], 31)
         try:

@@ -524,7 +524,7 @@ def test_a_cancelled_flight_of_a_swarm_is_not_executed(proxy: ScriptedProxy) -> 
 def test_an_interrupted_flight_of_a_swarm_is_not_executed(
     proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-C while each drone is awaited on its own thread."""
+    """Press Ctrl-C while the drones are awaited on separate threads."""
     drone = skyloop.client.connect("me")
 
     def interrupt(_thread: threading.Thread, _timeout_s: float | None = None) -> None:

@@ -133,7 +133,7 @@ def test_after_its_time_is_over_it_is_not_requested_again(held: AuthorityTracker
 
 
 def test_feedback_may_overtake_the_event_of_expiry(held: AuthorityTracker) -> None:
-    """Shown as pre-empted, it would wait for ever in a queue that it is not in."""
+    """Shown as pre-empted, it would wait forever in a queue that it is not in."""
     assert held.feedback(owned(9, 6, "next"), NOW)
     assert held.status.state == "preempted"
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="expired", by="next"), NOW)
@@ -226,7 +226,7 @@ def test_the_oldest_ended_session_is_forgotten() -> None:
 def test_feedback_before_the_event_of_a_loss_does_not_make_it_a_takeover(
     held: AuthorityTracker, reason: str, state: str, wanted: bool
 ) -> None:
-    """It showed "preempted" for ever, and requested nothing any more."""
+    """It showed "preempted" forever, and requested nothing any more."""
     assert held.feedback(owned(9, 6, "other"), NOW)
     assert held.status.state == "preempted"
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason=reason, by="other"), LATER)

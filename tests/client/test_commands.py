@@ -151,7 +151,7 @@ def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
     assert drone.feedback().state is FlightState.LANDED
     thread.join(WAIT_S)
     after = len(proxy.commands)
-    proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land for ever")
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land forever")
 
 
 def test_a_landing_without_room_is_sent_before_the_next_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -728,7 +728,7 @@ def test_a_set_point_returns_false_while_set_points_are_refused(proxy: ScriptedP
 
 
 def test_a_landing_is_repeated_until_the_proxy_reports_it_as_complete(proxy: ScriptedProxy, drone: Drone) -> None:
-    """Earlier feedback said "landed": one packet was sent, then Idle. If that packet was lost, it kept hovering."""
+    """Earlier feedback showed "landed": one packet was sent, then Idle. If that was lost, the drone kept hovering."""
     proxy.more["outcome"] = Outcome()
     drone.wait(lambda feedback: feedback.outcome is not None, WAIT_S)
     landing = background(lambda: drone.land(timeout_s=WAIT_S))

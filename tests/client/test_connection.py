@@ -180,7 +180,7 @@ def test_a_proxy_without_feedback_is_pinged_and_resubscribed(proxy: ScriptedProx
 
 
 def test_readers_follow_a_proxy_that_restarts_with_another_camera(proxy: ScriptedProxy, drone: Drone) -> None:
-    """The reader waited for the old camera for ever."""
+    """The reader waited for the old camera forever."""
     found: list[str] = []
     reads = background(lambda: found.append(next(drone.frames(timeout_s=WAIT_S)).camera))
     proxy.until(lambda: proxy.server.subscribers("video/front") == 1, "the first subscription")

@@ -1,4 +1,4 @@
-"""An application's emergency stop continues until it shows, whatever else the application commands."""
+"""An application's emergency stop is repeated until the vehicle confirms it, whatever else it commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``drone.log``: what is sent, what is refused, and what listeners get."""
+"""``drone.log``: entries sent, entries refused, and what callbacks receive."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class DronePage:
 
     def __init__(self, page: Page, drone: str) -> None:
         self.page = page
-        self.problems: list[str] = []  #: what went wrong in it, as the browser says
+        self.problems: list[str] = []  #: errors in it, as reported by the browser
         self.pane = page.locator(f'.pane[data-drone="{drone}"]')
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.on("console", self._hear)

@@ -176,7 +176,7 @@ def test_the_lists_are_never_longer_than_allowed(steps: list[tuple[str, str]]) -
 
 
 class Speaker(asyncio.Protocol):
-    """Says hello."""
+    """A handler that sends a greeting."""
 
     def connection_made(self, transport: Any) -> None:
         transport.write(b"hello")

@@ -253,7 +253,7 @@ def test_video_one_frame_until_acknowledged_then_the_newest(client: TestClient, 
         assert (head["width"], head["height"], head["camera"]) == (64, 48, "front")
         assert 0 <= head["age_s"] < 5
         assert image.mean() == pytest.approx(10, abs=2)
-        for shade in (60, 110, 160):  # nothing of these is sent: the first is not acknowledged
+        for shade in (60, 110, 160):  # none of these is sent, because the first is not acknowledged
             drone.show(shade)
         until(lambda: statistics(client)["frames_sent"] == 1)
         assert statistics(client)["frames_sent"] == 1

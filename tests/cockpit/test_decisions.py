@@ -57,7 +57,7 @@ def slow_parameters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], No
 
 
 @pytest.mark.parametrize("newer", ["hover", "land", "fly"])
-def test_a_flight_after_a_target_that_waits_for_answers_does_not_override_what_was_pressed_since(
+def test_following_a_target_that_waits_for_answers_does_not_override_later_presses(
     client: TestClient, node: Node, newer: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A landing was broken off by a target that was marked before it."""
@@ -79,7 +79,7 @@ def test_a_flight_after_a_target_that_waits_for_answers_does_not_override_what_w
 
 
 @pytest.mark.parametrize("newer", ["hover", "land", "goto"])
-def test_a_route_that_is_still_checked_does_not_override_what_was_pressed_since(
+def test_a_route_still_being_checked_does_not_override_later_presses(
     client: TestClient, node: Node, newer: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with page(client) as pilot:
@@ -96,7 +96,7 @@ def test_a_route_that_is_still_checked_does_not_override_what_was_pressed_since(
             assert node.flyer.place[0] < 1.0
 
 
-def test_a_flight_after_a_target_is_not_begun_when_the_answers_took_too_long(
+def test_following_a_target_does_not_start_if_the_answers_took_too_long(
     client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with page(client) as first:
@@ -126,7 +126,7 @@ def test_a_page_that_was_away_meanwhile_flies_no_route(
         assert "the page was silent" in pilot.wait("refused", do="route")["why"]
 
 
-# What nobody decides ----------------------------------------------------------------------------------------------
+# Undecided -------------------------------------------------------------------------------------------------------
 
 
 def go_to(client: TestClient, pilot: Page) -> None:

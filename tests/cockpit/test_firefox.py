@@ -98,7 +98,7 @@ def test_fingers_arrive(deck: Deck) -> None:
     assert page.problems == []
 
 
-def test_a_finger_scrubs_a_replay_and_its_end_is_said(deck: Deck, tmp_path: Path) -> None:
+def test_a_finger_scrubs_a_replay_whose_end_is_announced(deck: Deck, tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.mcap", Plan(seconds=4.0))
     deck.address = deck.cockpit("--recordings", str(tmp_path))
     page = deck.overview(has_touch=True)

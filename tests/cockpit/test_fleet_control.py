@@ -118,7 +118,7 @@ def test_landing_all_continues_without_the_page(nodes: tuple[Node, Node]) -> Non
         until(lambda: nodes[0].flyer.state is FlightState.LANDED)
 
 
-def test_old_orders_to_all_are_refused(nodes: tuple[Node, Node]) -> None:
+def test_old_commands_to_all_are_refused(nodes: tuple[Node, Node]) -> None:
     with cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client, everybody(client) as pilot:
         pilot.say("stop_all", at_s=time.monotonic() - 3.0)
         assert "3.0 s after" in pilot.wait("refused", do="stop_all")["why"]

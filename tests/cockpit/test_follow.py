@@ -75,7 +75,7 @@ def draws(watcher: Drone, frames: int) -> None:
         pass
 
 
-def test_what_is_marked_is_tracked_then_flown_after_and_stopped(
+def test_a_marked_target_is_tracked_then_followed_until_stopped(
     client: TestClient, node: Node, stand_ins: StandIns
 ) -> None:
     drawn: list[Annotation] = []
@@ -115,7 +115,7 @@ def test_what_is_marked_is_tracked_then_flown_after_and_stopped(
     until(lambda: not any(thread.name == "skyloop-follow" for thread in threading.enumerate()))
 
 
-def test_a_box_with_a_mode_is_flown_after_at_once(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+def test_a_box_with_a_mode_is_followed_at_once(client: TestClient, node: Node, stand_ins: StandIns) -> None:
     with marker(client) as pilot:
         pilot.take()
         pilot.mark(mode="follow")
@@ -345,7 +345,7 @@ def test_a_tracker_that_is_stuck_flies_nothing(client: TestClient, node: Node, s
         pilot.wait("follow", state="flying")
 
 
-def test_an_old_request_no_longer_sets_off(
+def test_an_old_request_does_not_start_following(
     client: TestClient, node: Node, stand_ins: StandIns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("skyloop.cockpit.follow_session.SET_OFF_S", 0.2)

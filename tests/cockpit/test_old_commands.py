@@ -115,7 +115,7 @@ def test_old_key_presses_do_not_cut_the_motors(client: TestClient, node: Node) -
         until(lambda: node.flyer.state is FlightState.EMERGENCY)
 
 
-def test_old_stick_commands_are_ignored_and_no_sign_of_life(client: TestClient, node: Node) -> None:
+def test_old_stick_commands_are_ignored_and_not_signs_of_life(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()
         pilot.say("fly", forward=0.3)

@@ -143,7 +143,7 @@ def test_authority_passes_from_a_controller_to_a_person_and_back(deck: Deck) -> 
         assert page.pane.get_attribute("data-mine") == "false"
 
 
-def test_who_is_no_higher_asks_with_the_same_press_and_hears_when_it_has_control(deck: Deck) -> None:
+def test_a_page_of_no_higher_priority_asks_with_one_press_and_is_notified_of_control(deck: Deck) -> None:
     deck.proxy("busy")
     page = deck.page("busy")
     first = page.pane.get_by_role("button", name="Ask first")
@@ -241,7 +241,7 @@ def test_a_question_that_is_withdrawn_vanishes(deck: Deck) -> None:
     assert page.pane.get_attribute("data-mine") == "true"
 
 
-def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
+def test_a_person_asks_first_waits_and_cancels(deck: Deck) -> None:
     deck.proxy("first")
     allow_time("first")
     page = deck.page("first")

@@ -210,7 +210,7 @@ def test_the_emergency_stop_is_held_shown_as_it_counts_and_names_the_drone(deck:
         page.page.mouse.up()
 
 
-def test_keys_stop_what_is_seen_not_what_was_opened_last(deck: Deck) -> None:
+def test_keys_stop_the_visible_drone_not_the_one_opened_last(deck: Deck) -> None:
     deck.proxy("upper", SMALL)
     deck.proxy("lower", SMALL)
     page = deck.page("upper", "lower")
@@ -222,7 +222,7 @@ def test_keys_stop_what_is_seen_not_what_was_opened_last(deck: Deck) -> None:
     page.until(lambda: "upper" in own.inner_text(), "the other one, when it is")
 
 
-def test_land_all_and_stop_all_are_there_with_nothing_opened(deck: Deck) -> None:
+def test_land_all_and_stop_all_are_available_with_no_drone_open(deck: Deck) -> None:
     deck.proxy("one", SMALL)
     deck.proxy("two", SMALL)
     page = deck.page("one", "two")

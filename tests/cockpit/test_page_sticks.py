@@ -136,7 +136,7 @@ def test_a_finger_on_another_drone_flies_that_one_with_nothing_and_lifted_finger
         assert stays(page, left)
 
 
-def test_a_stick_that_is_let_go_where_it_is_not_shown_is_let_go(deck: Deck) -> None:
+def test_a_stick_released_while_hidden_is_released(deck: Deck) -> None:
     """Held, All drones pressed, lifted there: opened again, the drone flew untouched."""
     size = {"width": 1200, "height": 1900}
     with flown(deck, "alone", viewport=size, has_touch=True) as (page, _, (drone,)):
@@ -224,7 +224,7 @@ def test_control_that_comes_back_while_a_stick_is_held_flies_nothing(deck: Deck)
         assert stays(page, drone)
 
 
-def test_a_page_that_is_left_and_come_back_to_flies_nothing_that_was_held(deck: Deck) -> None:
+def test_sticks_held_while_the_page_was_hidden_fly_nothing_on_return(deck: Deck) -> None:
     """By Back and Forward, as a browser may keep a page unchanged."""
     with flown(deck, "back") as (page, _, (drone,)):
         keyboard = page.page.keyboard
@@ -256,7 +256,7 @@ def test_two_tabs_fly_one_drone_each_in_its_turn(deck: Deck) -> None:
         keyboard.up("w")
 
 
-def test_what_an_input_method_composes_flies_nothing_and_does_not_keep_the_stop_away(deck: Deck) -> None:
+def test_text_composed_by_an_input_method_flies_nothing_and_does_not_block_the_stop(deck: Deck) -> None:
     with flown(deck, "typed") as (page, _, (drone,)):
         session = page.page.context.new_cdp_session(page.page)
         page.page.evaluate("document.body.append(Object.assign(document.createElement('input'), {id: 'typed-here'}))")

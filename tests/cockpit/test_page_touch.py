@@ -67,7 +67,7 @@ def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
             edges |= {"right": found["x"] + found["width"], "bottom": found["y"] + found["height"]}
             assert apart(stick, edges), button.text_content()
             assert within(edges, screen), button.text_content()
-            assert apart(holder, edges), f"who has control is written below {button.text_content()}"
+            assert apart(holder, edges), f"the holder of control is written below {button.text_content()}"
     assert sticks[0]["left"] < 0.05 * size[0] + 12
     assert sticks[1]["right"] > 0.95 * size[0] - 12
     for shown in (".pill", ".battery", ".hud", ".holder", ".chip.age"):

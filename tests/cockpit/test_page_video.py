@@ -36,7 +36,7 @@ pytest.importorskip("av", reason="H.264 needs: skyloop install video")
 NO_DECODER: Final = "delete window.VideoDecoder"
 BROKEN: Final = "VideoDecoder.prototype.decode = () => { throw new Error('broken') }"
 INSECURE: Final = "Object.defineProperty(window, 'isSecureContext', { value: false })"
-#: Loses what comes over WebSockets in binary while ``window.lose`` is above 0, and notes what is sent.
+#: Drops binary WebSocket messages while ``window.lose`` is above 0, and records sent messages.
 LOSES: Final = """
 window.lose = 0;
 window.said = [];
@@ -150,7 +150,7 @@ def test_a_page_that_falls_behind_shows_why_its_picture_is_smaller(deck: Deck) -
     assert said.endswith(("this connection is slow", "this computer is busy", "reach the cockpit late"))
 
 
-def test_tiles_show_h264_and_tell_what_it_takes(deck: Deck) -> None:
+def test_tiles_show_h264_and_its_data_rate(deck: Deck) -> None:
     page = deck.overview()
     tile = page.page.locator('.tile[data-drone="film"]')
     page.until(lambda: (tile.get_attribute("data-form") or "").startswith("h264"), "H.264 is shown", MOST_S)
@@ -187,7 +187,7 @@ def emulated(kind: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("kind", ["ardrone2", "tello"])
-def test_what_the_vehicle_encodes_is_shown_as_it_comes(deck: Deck, kind: str) -> None:
+def test_video_encoded_by_the_vehicle_is_shown_unchanged(deck: Deck, kind: str) -> None:
     """The proxy runs here, which shows that it encodes nothing."""
     with emulated(kind) as address:
         proxy = Proxy(make_driver(address), LocalServer(kind), name=kind)

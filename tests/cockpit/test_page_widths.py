@@ -1,4 +1,4 @@
-"""The buttons that stop and land are on the screen: at every width and zoom, with long words, long names and alarms."""
+"""The stop and landing buttons are on the screen: at every width and zoom, with long words, long names and alarms."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_a_route_fits_from_320_pixels_on(deck: Deck) -> None:
         assert page.page.evaluate(CUT) == [], width
 
 
-#: What of a pane lies below its line of alarms, and is no part of it.
+#: The parts of a pane below its line of alarms.
 COVERED = """() => [...document.querySelectorAll(".pane :is(button, h2, .pill, .chip)")].filter((one) => {
   const box = one.getBoundingClientRect();
   if (!one.checkVisibility({visibilityProperty: true}) || box.top < 0 || box.bottom > innerHeight) return false;
@@ -244,7 +244,7 @@ def landed(page: DronePage) -> None:
     page.page.mouse.up()
 
 
-#: Hears nothing of the list of drones while ``window.deaf`` is true.
+#: Drops the list of drones while ``window.deaf`` is true.
 DEAF = """
 window.WebSocket = class extends WebSocket {
   constructor(...given) {

@@ -112,7 +112,7 @@ def test_the_page_saves_loads_and_deletes(client: TestClient) -> None:
         ("/api/drones/nobody/route/check", TRIANGLE, 404, "nobody"),
     ],
 )
-def test_what_is_wrong_is_refused(client: TestClient, path: str, body: Any, status: int, words: str) -> None:
+def test_invalid_routes_are_refused(client: TestClient, path: str, body: Any, status: int, words: str) -> None:
     answer = client.post(path, json=body)
     assert answer.status_code == status
     assert words in answer.text

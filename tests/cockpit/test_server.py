@@ -53,7 +53,7 @@ def tokens(tmp_path: Path) -> Path:
     return path
 
 
-# What goes wrong ---------------------------------------------------------------------------------------------------
+# Errors ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::"])
@@ -318,7 +318,7 @@ def test_where_no_one_tells_whose_program_connects_the_browser_is_paired(
             urllib.request.urlopen(login)
 
 
-# As a process of its own --------------------------------------------------------------------------------------------
+# As a separate process ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.daily

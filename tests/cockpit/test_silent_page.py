@@ -111,7 +111,7 @@ def test_a_returning_page_continues_without_its_earlier_commands() -> None:
 
 @pytest.mark.parametrize("sticks", [Velocity(forward=0.5), Attitude(pitch=0.1)])
 def test_sticks_from_before_a_short_silence_do_not_fly_on_beside_its_signs_of_life(sticks: Velocity | Attitude) -> None:
-    """It was too short for the failsafe, and ``Idle`` leaves a vehicle as it is: it flew on by them without end."""
+    """It was too short for the failsafe, and ``Idle`` changes nothing: the vehicle kept flying by those sticks."""
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)
@@ -123,7 +123,7 @@ def test_sticks_from_before_a_short_silence_do_not_fly_on_beside_its_signs_of_li
 
 
 @pytest.mark.parametrize("action", [Land(), Hover()])
-def test_what_a_person_ended_the_flight_with_in_the_silence_is_repeated_when_it_is_over(action: Land | Hover) -> None:
+def test_a_command_that_ended_the_flight_during_a_silence_is_repeated_afterwards(action: Land | Hover) -> None:
     """It was sent once, and dropped with the sticks: where that one packet was lost it flew on by them."""
     flown = Flown()
     flown.hold(5)
@@ -136,7 +136,7 @@ def test_what_a_person_ended_the_flight_with_in_the_silence_is_repeated_when_it_
     assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(action, False)}
 
 
-def test_older_news_never_overrides_newer_news() -> None:
+def test_older_reports_never_override_newer_ones() -> None:
     flown = Flown()
     flown.hold(5)
     flown.pilot.present_until(flown.now_ns + 2 * S)

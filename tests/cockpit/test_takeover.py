@@ -137,7 +137,7 @@ def test_the_first_of_several_in_line_gets_control(client: TestClient, node: Nod
                 assert late.authority.state == "queued"
 
 
-def test_only_who_has_control_can_answer(client: TestClient, node: Node) -> None:
+def test_only_the_holder_of_control_can_answer(client: TestClient, node: Node) -> None:
     with node.connect("demo"), page(client) as pilot, asks(node) as drone:
         pilot.say("answer", id=drone.app_id, grant=True)
         assert pilot.wait("refused", do="answer")["why"] == "take control first"

@@ -184,7 +184,7 @@ def test_names_can_be_given_if_the_file_has_none(tmp_path: Path) -> None:
         ({"weights": [row[:3] for row in MIXED]}, "a set-point of velocity has 4 numbers .* not 3"),
     ],
 )
-def test_files_that_are_no_policy_are_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
+def test_files_that_are_not_policies_are_refused(tmp_path: Path, how: dict[str, Any], words: str) -> None:
     with pytest.raises(FileFormatError, match=words):
         PolicyNetwork(write(tmp_path / "policy.onnx", **how))
 

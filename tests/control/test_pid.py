@@ -53,7 +53,7 @@ def test_derivative_is_filtered() -> None:
 
 
 def test_back_calculation_keeps_the_overshoot_small() -> None:
-    """Compared with the same loop with a limit outside that it does not know of."""
+    """Compared with the same loop and an external limit that is unknown to it."""
     gains = Gains(p=2.0, i=4.0)
     wound = Pid(gains)
     y = top = 0.0

@@ -1,4 +1,4 @@
-"""What docs/ardrone.md says of the video is what the code does."""
+"""``docs/ardrone.md`` describes the video as the code handles it."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ def words(line: str) -> list[str]:
 
 
 def parse(name: str, arguments: list[str]) -> None:
-    """Raises what the command line would tell the user."""
+    """Parse a command line; raise the error that the user would see."""
     command = GROUP.commands[name]  # type: ignore[attr-defined]
     command.make_context(name, list(arguments))
 
@@ -74,7 +74,7 @@ INSTALLS = sorted(
 
 
 @pytest.mark.parametrize("line", INSTALLS)
-def test_extras_that_are_to_be_installed_exist(line: str) -> None:
+def test_extras_to_install_exist(line: str) -> None:
     assert set(words(line)[2:]) <= {*EXTRAS, "all"}
 
 

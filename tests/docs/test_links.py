@@ -1,4 +1,4 @@
-"""What the pages point to is there."""
+"""Links and files named on the pages exist."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def anchors(page: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
+def test_links_within_the_repository_resolve(page: Path) -> None:
     for target in links(page):
         path, _, anchor = target.partition("#")
         file = (page.parent / path).resolve() if path else page
@@ -36,7 +36,7 @@ def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_files_that_are_named_exist(page: Path) -> None:
+def test_named_files_exist(page: Path) -> None:
     for span in spans(page):
         for named in re.findall(r"(?:^|\s)((?:docs|src|tests|scripts)/[\w./-]*)(?=\s|$)", span):
             assert (ROOT / named).exists(), f"{page.name} names {named}"

@@ -1,4 +1,4 @@
-"""A promise on a page is held by a test, which has to be there."""
+"""The tests that the pages name for their promises exist."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def existing() -> set[str]:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_tests_that_a_page_names_exist(page: Path, existing: set[str]) -> None:
+def test_tests_named_on_pages_exist(page: Path, existing: set[str]) -> None:
     named = [span for span in spans(page) if _TEST.fullmatch(span)]
     assert [name for name in named if name not in existing] == []
 
 
-def test_each_promise_names_what_holds_it() -> None:
+def test_each_promise_names_its_tests() -> None:
     promises = [cells for cells in rows(section(SECURITY, "## Threat model")) if "`test" in cells[-1]]
     assert len(promises) > 15
     table = section(SECURITY, "## Threat model").partition("| promise | held by |")[2]

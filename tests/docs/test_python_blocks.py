@@ -1,4 +1,4 @@
-"""Every Python example of the pages runs as it stands, but for shorter flights."""
+"""Every Python example on the pages runs unchanged, except for shorter flights."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from skyloop.messages import Feedback
 from tests.support.pages import Block, blocks
 from tests.support.recordings import recorded
 
-LONGEST_RUN_S = 10.0  # of a controller, whatever the example says
+LONGEST_RUN_S = 10.0  # of a controller, regardless of the example
 BLOCKS = blocks("python")
 FIRST = next(block for block in BLOCKS if block.page.name == "README.md")
 Flight = tuple[RunSummary, Feedback]
 
 #: What an example must have printed.
 PRINTS = {"pictures, in order": "pictures, in order: True", "lost in {": "lost in 0 of 20 frames"}
-#: What stands for a file of the reader's: something that was recorded from a real vehicle.
+#: Recordings of real vehicles that replace the reader's own files.
 FILES = {"flight.pave": "ardrone2/video-8s.pave"}
 
 

@@ -34,14 +34,14 @@ def test_the_reference_has_each_name_that_skyloop_offers(name: str) -> None:
     assert re.search(rf"\b{name}\b", REFERENCE["skyloop"])
 
 
-def test_what_other_packages_leave_out_is_shown_with_skyloop() -> None:
+def test_names_not_documented_elsewhere_are_shown_with_skyloop() -> None:
     left_out = ",".join(re.findall(r":exclude-members: (.+)", "\n".join(REFERENCE.values())))
     for name in filter(None, (name.strip() for name in left_out.split(","))):
         assert re.search(rf"^\.\. auto(class|function):: {name}$", REFERENCE["skyloop"], re.MULTILINE), name
 
 
 def test_the_reference_has_each_command_with_its_options() -> None:
-    """What becomes of it in the site is checked by ``make docs``."""
+    """``make docs`` checks the result in the site."""
     text = runpy.run_path(str(ROOT / "scripts" / "command_reference.py"))["reference"]()
     sections = dict(re.findall(r"^\.\. program:: skyloop (.+)\n((?:(?!\.\. program::).*\n)*)", text, re.MULTILINE))
     assert set(COMMANDS) <= set(sections)
@@ -70,7 +70,7 @@ def test_the_first_programs_fit_beside_the_navigation(page: str) -> None:
             assert max(map(len, block.code.splitlines())) <= 88, str(block)
 
 
-def test_the_guides_are_in_groups() -> None:
+def test_the_guides_are_grouped() -> None:
     trees = [re.findall(r"^[\w/-]+$", tree, re.MULTILINE) for tree in _TOCTREE.findall(INDEX)]
     guides = [tree for tree in trees if not any(page.startswith(("api/", "start/")) for page in tree)]
     assert max(map(len, guides)) <= 11

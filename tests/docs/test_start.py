@@ -18,7 +18,7 @@ from skyloop.control.loading import load_controller
 from tests.support.pages import ROOT, Block, blocks
 
 START = ROOT / "docs" / "start"
-MOST_LINES = 130  # two screens of reading, and a table of what goes wrong
+MOST_LINES = 130  # two screens of text, and a table of problems
 
 
 def program(page: str) -> Block:

@@ -33,7 +33,7 @@ def names(cell: str) -> list[str]:
 
 
 @pytest.mark.parametrize("page", list(PAGES))
-def test_what_is_made_of_the_code_is_up_to_date(page: str) -> None:
+def test_generated_tables_are_up_to_date(page: str) -> None:
     text, wanted = made(page)
     assert text == wanted, "run python -m scripts.doc_tables"
 

@@ -344,7 +344,7 @@ def received(connection: socket.socket) -> tuple[bytes, bool]:
 
 
 def test_data_buffered_at_closing_are_not_delivered_later(peer: socket.socket) -> None:
-    """The vehicle's network comes back when no one flies it any more: it must not be armed then."""
+    """The vehicle's network may return when no one flies it any more: it must not be armed then."""
     stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
     connection, _ = peer.accept()
     with suppress(ConnectionError):

@@ -91,7 +91,9 @@ def test_a_scheme_claimed_twice_names_both(site: Path) -> None:
         driver_class("contested")
 
 
-def test_one_package_found_through_two_folders_is_no_contest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_package_found_through_two_folders_is_not_a_conflict(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for folder in ("one", "two"):
         install(tmp_path / folder, "same_drone", "samedrone = same_module:SameDriver")
         monkeypatch.syspath_prepend(str(tmp_path / folder))

@@ -1,4 +1,4 @@
-"""A driver for ``toy://``: a point that floats where it is told to."""
+"""A driver for ``toy://``: a point that moves as commanded."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ToyDriver(Driver):
 
     def capabilities(self) -> Capabilities:
         actions = frozenset({"velocity", "emergency_stop", "reset_emergency"})
-        return Capabilities(vehicle="toy", actions=actions, description="a point that floats where it is told to")
+        return Capabilities(vehicle="toy", actions=actions, description="a point that moves as commanded")
 
     def parameters(self) -> list[Parameter]:
         limit = Parameter(
@@ -51,7 +51,7 @@ class ToyDriver(Driver):
             minimum=0.1,
             maximum=5.0,
             default=1.0,
-            description="greatest speed along each axis",
+            description="maximum speed along each axis",
         )
         return [limit]
 

@@ -12,7 +12,7 @@ import pytest
 import skyloop
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
-#: Examples that join shared drones, and the commands that they tell the user to run.
+#: Examples that join shared drones, and the commands that they ask the user to run.
 JOINING = {
     "shared_drone": "start the drone first: skyloop sim --name alpha",
     "swarm_formation": "start three drones first: skyloop sim --drones 3 --name drone --option cameras=none",

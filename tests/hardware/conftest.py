@@ -1,7 +1,7 @@
-"""Tests that fly a vehicle that somebody names: ``pytest tests/hardware --drone=mavlink://udpin:127.0.0.1:14540``.
+"""Tests that fly a vehicle of your choice: ``pytest tests/hardware --drone=mavlink://udpin:127.0.0.1:14540``.
 
-The vehicle takes off, moves some metres and lands, twice. **Simulated, tied down or netted in, with nobody near.**
-Without ``--drone`` they are skipped.
+The vehicle takes off, moves some metres and lands, twice. **It must be simulated, tethered or in a net, with no person
+near.** Without ``--drone`` the tests are skipped.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="session")
 def address(request: pytest.FixtureRequest) -> str:
-    """Of the vehicle to fly."""
-    given = request.config.getoption("--drone", None)  # unknown where these tests are not named on the command line
+    """Return the address of the vehicle to fly."""
+    given = request.config.getoption("--drone", None)  # unknown unless pytest was given this folder
     if not given:
         pytest.skip("no vehicle is named: --drone=ADDRESS")
     return str(given)

@@ -1,4 +1,4 @@
-"""A proxy in a process of its own and an application that flies it, with the patience that real autopilots need."""
+"""A proxy in a separate process and an application that flies it, with the time limits that real autopilots need."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import skyloop
 from skyloop.messages import Feedback, FlightState, LinkState
 
 NAME = "hardware"
-READY_S = 120.0  #: from the start of an autopilot until it may be armed: 40 s were seen, EKF and GPS included
+READY_S = 120.0  #: from an autopilot's start until it may be armed: up to 40 s were observed, including EKF and GPS
 TAKEOFF_S = 60.0
 LANDING_S = 60.0
 LINK_S = 60.0
 
 
 class Rig:
-    """One vehicle's proxy, started and killed as often as need be."""
+    """One vehicle's proxy, which can be started and killed repeatedly."""
 
     def __init__(self, address: str) -> None:
         self.address = address
@@ -31,12 +31,12 @@ class Rig:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  closed by end()
 
     def start(self) -> None:
-        """A proxy that serves."""
+        """Start a proxy."""
         command = [sys.executable, "-m", "skyloop", "proxy", self.address, "--name", NAME]
         self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
 
     def connect(self) -> skyloop.Drone:
-        """A pilot, as soon as the proxy serves and the vehicle is heard."""
+        """Connect as a pilot as soon as the proxy serves and the vehicle is found."""
         deadline = time.monotonic() + LINK_S
         while True:
             try:
@@ -45,19 +45,19 @@ class Rig:
             except skyloop.SkyloopError:
                 assert time.monotonic() < deadline, self.said()
                 time.sleep(0.2)
-        until(drone, lambda f: f.vehicle_link in (LinkState.UP, LinkState.DEGRADED), LINK_S, "the vehicle is heard")
+        until(drone, lambda f: f.vehicle_link in (LinkState.UP, LinkState.DEGRADED), LINK_S, "the vehicle is found")
         until(drone, lambda f: f.state is not FlightState.UNKNOWN, LINK_S, "its state is known")
         return drone
 
     def kill(self) -> None:
-        """The proxy dies without a word to anybody."""
+        """Kill the proxy."""
         assert self._process is not None
         self._process.send_signal(signal.SIGKILL)
         self._process.wait(10)
         self._process = None
 
     def end(self) -> None:
-        """In the end the proxy lands what flies and goes."""
+        """End the proxy, which lands a flying vehicle first."""
         if self._process is not None:
             self._process.send_signal(signal.SIGINT)
             try:
@@ -67,7 +67,7 @@ class Rig:
         self._log.close()
 
     def said(self) -> str:
-        """What the proxies wrote so far."""
+        """Return the output of the proxies so far."""
         self._log.seek(0)
         return self._log.read().decode(errors="replace")[-4000:]
 
@@ -79,7 +79,7 @@ def until(
     what: str,
     say: Callable[[], object] = lambda: None,
 ) -> Feedback:
-    """Wait for it, and ``say`` a command meanwhile; the vehicle's last words stand in the failure."""
+    """Wait for a condition, repeating the command ``say``; a failure quotes the vehicle's last events."""
     deadline = time.monotonic() + timeout_s
     while True:
         say()
@@ -92,21 +92,21 @@ def until(
 
 
 def place(feedback: Feedback) -> tuple[float, float, float]:
-    """East, north, up [m]."""
-    assert feedback.position_m is not None, "the vehicle does not tell where it is"
+    """Return the position east, north, up [m]."""
+    assert feedback.position_m is not None, "the vehicle does not report its position"
     return feedback.position_m
 
 
 def speed(feedback: Feedback) -> float:
-    """Horizontally [m/s]."""
-    assert feedback.velocity_m_s is not None, "the vehicle does not tell its speed"
+    """Return the horizontal speed [m/s]."""
+    assert feedback.velocity_m_s is not None, "the vehicle does not report its speed"
     return math.hypot(*feedback.velocity_m_s[:2])
 
 
 def holds(
     drone: skyloop.Drone, seconds: float, radius_m: float, what: str, say: Callable[[], object] = lambda: None
 ) -> None:
-    """It stays where it is, horizontally, for so long."""
+    """Check that the vehicle holds its horizontal position for this time."""
     begun = place(drone.feedback())
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
@@ -118,5 +118,5 @@ def holds(
 
 
 def runtime_folder() -> tempfile.TemporaryDirectory[str]:
-    """For sockets of these proxies alone."""
+    """Provide a folder for the sockets of these proxies alone."""
     return tempfile.TemporaryDirectory(prefix="skyloop-", dir=Path(tempfile.gettempdir()))

@@ -1,4 +1,4 @@
-"""Flies the vehicle of ``--drone`` through everything that a driver must get right, twice over."""
+"""Fly the vehicle of ``--drone`` twice through everything that a driver must get right."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.hardware.rig import (
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
-CLIMBS_M = 5.0  #: above its take-off at most
-PX4_HOLD = ("mavlink.com_obl_rc_act", 5)  #: what a PX4 without a remote control is to do when set-points stop
+CLIMBS_M = 5.0  #: maximum height above the take-off
+PX4_HOLD = ("mavlink.com_obl_rc_act", 5)  #: makes a PX4 without a remote control hold when set-points stop
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def rig(address: str) -> Iterator[Rig]:
 
 
 def test_it_gets_ready(rig: Rig) -> None:
-    """Attitude, place and battery are told, and that it may be armed."""
+    """It reports attitude, position and battery, and that it can be armed."""
     with rig.connect() as drone:
         until(drone, lambda f: bool((f.native or {}).get("mavlink.ready")), READY_S, "ready to be armed")
         newest = until(
@@ -61,7 +61,7 @@ def test_it_gets_ready(rig: Rig) -> None:
 
 @pytest.mark.parametrize("flight", [1, 2])
 def test_a_flight(rig: Rig, flight: int) -> None:
-    """Take-off, velocity, attitude, hover, a silent pilot, a killed proxy, landing; and then all of it again."""
+    """Take-off, velocity, attitude, hover, a silent pilot, a killed proxy, landing; then everything again."""
     drone = rig.connect()
     try:
         take_off(drone)
@@ -78,7 +78,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
             lambda: drone.velocity(forward=1.0),
         )
     finally:
-        drone.close()  # an application that is gone, which is a silent pilot to the proxy
+        drone.close()  # to the proxy, an application that is gone is a silent pilot
     stops_when_nobody_commands(rig)
     drone = rig.connect()
     try:
@@ -93,7 +93,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
         rig.kill()
     finally:
         drone.close()
-    time.sleep(6.0)  # until the autopilot missed the set-points, and could stop: nothing tells that to anybody
+    time.sleep(6.0)  # until the autopilot misses the set-points and could stop, which it does not report
     rig.start()
     drone = rig.connect()
     try:
@@ -115,12 +115,12 @@ def take_off(drone: skyloop.Drone) -> None:
         drone.config["limits.altitude"] = height + CLIMBS_M
     drone.takeoff(timeout_s=TAKEOFF_S)
     newest = until(drone, lambda f: (f.altitude_m or 0.0) - ground > 0.7 * height, 10.0, "at its height")
-    assert (newest.altitude_m or 0.0) - ground < height + 2.5  # a PX4 rises to MIS_TAKEOFF_ALT at least
+    assert (newest.altitude_m or 0.0) - ground < height + 2.5  # a PX4 rises at least to MIS_TAKEOFF_ALT
     assert newest.state in (FlightState.HOVERING, FlightState.FLYING)
 
 
 def flies_north(drone: skyloop.Drone) -> None:
-    """By velocity, whatever its heading."""
+    """Fly north by velocity, whatever the heading."""
     begun = place(drone.feedback())
     deadline = time.monotonic() + 20.0
     while place(drone.feedback())[1] - begun[1] < 2.0:
@@ -134,7 +134,7 @@ def flies_north(drone: skyloop.Drone) -> None:
 
 
 def flies_by_its_body(drone: skyloop.Drone) -> None:
-    """Forward turns with the heading."""
+    """Fly forward, which turns with the heading."""
     yaw = drone.feedback().yaw_rad
     assert yaw is not None
     until(
@@ -150,7 +150,7 @@ def flies_by_its_body(drone: skyloop.Drone) -> None:
 
 
 def goes(drone: skyloop.Drone, forward: float, left: float) -> None:
-    """A metre that way."""
+    """Fly a metre in this direction."""
     begun = drone.feedback()
     assert begun.yaw_rad is not None
     east, north, _ = place(begun)
@@ -168,7 +168,7 @@ def goes(drone: skyloop.Drone, forward: float, left: float) -> None:
 
 
 def flies_by_attitude(drone: skyloop.Drone) -> None:
-    """Tilts, climbs and sinks by rate; holds its altitude in between."""
+    """Tilt, climb and descend by attitude, holding the altitude between these."""
     low = drone.feedback().altitude_m or 0.0
     until(
         drone,
@@ -206,7 +206,7 @@ def flies_by_attitude(drone: skyloop.Drone) -> None:
 
 
 def fly_level(drone: skyloop.Drone, seconds: float) -> float:
-    """By attitude; the altitude then."""
+    """Fly level by attitude; return the altitude at the end."""
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         drone.attitude()
@@ -221,7 +221,7 @@ def hovers(drone: skyloop.Drone) -> None:
 
 
 def hold_without_set_points(drone: skyloop.Drone) -> int | None:
-    """Has a PX4 hold its place when set-points stop, instead of sinking to the ground; what was set before."""
+    """Make a PX4 hold its position instead of descending when set-points stop; return the previous setting."""
     name, wanted = PX4_HOLD
     deadline = time.monotonic() + 90.0
     while not any(known.startswith("mavlink.") for known in drone.config):
@@ -236,7 +236,7 @@ def hold_without_set_points(drone: skyloop.Drone) -> int | None:
 
 
 def stops_when_nobody_commands(rig: Rig) -> None:
-    """The ladder: it hovers by the autopilot's own mode. Somebody who looks sees it, before it would land."""
+    """Check that the ladder makes it hover in the autopilot's own mode, as observers see before it would land."""
     with skyloop.connect("hardware", access="observe", timeout_s=10.0) as observer:
         until(observer, lambda f: f.failsafe is not Failsafe.NONE, 5.0, "the failsafe is taken")
         until(observer, lambda f: f.state in (FlightState.HOVERING, FlightState.LANDING), 5.0, "it stopped flying")

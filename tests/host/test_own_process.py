@@ -34,7 +34,7 @@ def vehicle(code: str, lines: list[str]) -> OwnProcessVehicle:
     return OwnProcessVehicle(settings, lines.append, (sys.executable, "-c", SAY + code))
 
 
-def test_a_process_that_can_not_serve_says_why() -> None:
+def test_a_process_that_cannot_serve_says_why() -> None:
     for code, words in (
         ("say(condition='failed', failed='no such thing'); sys.exit(1)", "no such thing"),
         ("print('words of a driver'); sys.exit(3)", "exit code 3"),
@@ -97,7 +97,9 @@ time.sleep(60)
     assert landing.end(0.0, "it was removed", unless_flying=True)
 
 
-def test_in_a_hurry_a_process_that_still_lands_is_not_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_is_still_landing_is_not_killed_in_a_hurry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A vehicle that can't hover alone must still land: killed after 8 s, its process let it fall."""
     stop = RestartingChild.stop
     monkeypatch.setattr(RestartingChild, "stop", lambda runner: stop(runner, 0.05, 0.05))

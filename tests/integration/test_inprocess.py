@@ -206,7 +206,7 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     node.proxy = Proxy(node.vehicle, node.server, name="alpha")
     node.proxy.handler.flight.began_before(
         node.proxy.clock() + BELIEF_NS
-    )  # as the flight record tells a named proxy that was killed
+    )  # as a killed named proxy learns from the flight record
     started_s = time.monotonic()
     node.proxy.start()
     drone.wait(lambda _: drone.link.application is LinkState.UP and drone.authority.state == "held", WAIT_S)

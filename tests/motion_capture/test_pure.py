@@ -65,7 +65,7 @@ def test_addresses(address: str, kind: str, up: str, configuration: dict[str, st
         (3, "not a motion capture system"),
     ],
 )
-def test_errors_about_addresses_say_what_is_right(address: str, said: str) -> None:
+def test_errors_about_addresses_show_the_right_form(address: str, said: str) -> None:
     with pytest.raises((UsageError, UnknownNameError), match=said):
         parse_system(address)
 

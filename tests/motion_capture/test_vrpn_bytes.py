@@ -91,7 +91,7 @@ def test_any_bytes_decode_or_are_a_decode_error(data: bytes) -> None:
 
 
 @given(st.integers(0, len(GREETING + GOLDEN_POSE) - 1), st.integers(1, 255))
-def test_one_wrong_byte_is_no_crash(at: int, change: int) -> None:
+def test_one_wrong_byte_causes_no_crash(at: int, change: int) -> None:
     stream = bytearray(GREETING + GOLDEN_POSE)
     stream[at] ^= change
     try:
@@ -102,7 +102,7 @@ def test_one_wrong_byte_is_no_crash(at: int, change: int) -> None:
 
 
 @given(st.integers(0, len(GREETING + GOLDEN_POSE) - 1))
-def test_a_stream_cut_short_is_no_pose(size: int) -> None:
+def test_a_truncated_stream_is_not_a_pose(size: int) -> None:
     assert Decoder().feed((GREETING + GOLDEN_POSE)[:size]) == []
 
 
@@ -164,7 +164,7 @@ def test_a_name_in_no_encoding_and_one_with_control_characters_can_be_printed() 
         assert pose.tracker == shown
 
 
-def test_nan_is_left_to_the_check_of_poses() -> None:
+def test_nan_is_left_to_the_pose_checks() -> None:
     (pose,) = Decoder().feed(GREETING + encode_pose(1, 5, 0, (math.nan, math.inf, 0.0), POSE.quaternion))
     assert math.isnan(pose.position[0])
 

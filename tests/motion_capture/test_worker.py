@@ -105,7 +105,7 @@ def test_a_missing_package_names_what_to_install() -> None:
         source("raise SystemExit(3)", [], []).start(20.0)
 
 
-def test_a_childs_complaint_is_reported() -> None:
+def test_a_childs_error_is_reported() -> None:
     told: list[str] = []
     failing = source("import sys; sys.exit('no such host')", [], told)
     with pytest.raises(LinkError, match="no frame within"):
@@ -114,7 +114,7 @@ def test_a_childs_complaint_is_reported() -> None:
     assert any("no such host" in text for text in told)
 
 
-def test_the_child_itself_says_why_it_ends_and_nothing_else() -> None:
+def test_the_child_reports_only_why_it_ends() -> None:
     told: list[str] = []
     with pytest.raises((LinkError, MissingExtraError)):
         ChildSource(parse_system("qualisys://127.0.0.1"), lambda _: None, told.append).start(5.0)

@@ -52,7 +52,7 @@ def test_a_refusal_is_raised_with_its_reason() -> None:
         join(session(refused), "alpha", RUN, layout.new_id())
 
 
-def test_a_timed_out_answer_is_no_refusal() -> None:
+def test_a_timed_out_answer_is_not_a_refusal() -> None:
     """A router answers a timed-out query with an error; the application must ask again."""
     late = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"Timeout")), ok=None)
     with pytest.raises(NoAnswerError, match="found on the network but did not answer"):

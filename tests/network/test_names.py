@@ -189,7 +189,7 @@ def test_a_connection_is_notified_when_its_proxy_stops_and_can_be_made_again() -
         client.close()
 
 
-def test_invalid_answers_are_no_proxies() -> None:
+def test_invalid_answers_are_not_proxies() -> None:
     """Another node on the network answers for proxies, with a token that no proxy has."""
     at, lair = place(), place()
     about = packets.ProxyInfo("bravo", layout.new_id(), 1, "there", 1, "fake://bravo", "nowhere")

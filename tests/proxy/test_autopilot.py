@@ -505,7 +505,7 @@ def test_forbidden_velocities_are_not_flown() -> None:
     assert told.up > 0.0
 
 
-# A vehicle that says itself whether it stands -------------------------------------------------------------------------
+# A vehicle that reports whether it is on the ground -------------------------------------------------------------------
 
 
 def seen(autopilot: Autopilot, state: FlightState, now_ns: int, altitude_m: float) -> Attitude | Velocity | None:

@@ -23,8 +23,8 @@ def test_repeats_of_a_stop_are_signs_of_life() -> None:
 
 
 @pytest.mark.parametrize("off_s", [-0.3, 0.06, 3600.0])
-def test_a_stop_with_a_wrong_timestamp_is_executed_but_no_sign_of_life(off_s: float) -> None:
-    """A stop from the future counted as one: packets with such a timestamp could keep a dead pilot alive for ever."""
+def test_a_stop_with_a_wrong_timestamp_is_executed_but_is_not_a_sign_of_life(off_s: float) -> None:
+    """A stop from the future counted as one: packets with such a timestamp could keep a dead pilot alive forever."""
     with Bench() as bench:
         pilot = bench.airborne()
         bench.driver.answers = False

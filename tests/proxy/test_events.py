@@ -1,4 +1,4 @@
-"""Repeated events: the first is published at once, the others as sums, and nothing is kept for ever."""
+"""Repeated events: the first is published at once, the others as sums, and nothing is kept forever."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_ended_repetitions_are_forgotten() -> None:
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, S // 2)), max_size=80))
-def test_every_one_is_counted_once(history: list[tuple[str, int]]) -> None:
+def test_every_event_is_counted_once(history: list[tuple[str, int]]) -> None:
     repeats = RepeatedEvents()
     now = told = 0
     for key, later in history:

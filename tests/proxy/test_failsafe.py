@@ -184,7 +184,7 @@ def test_a_change_of_hands_does_not_abort_the_ladders_landing() -> None:
     assert taken(ladder, T0 + 6 * S, FLYING) == [FailsafeAction(Land())]
 
 
-def test_an_ordered_landing_stays() -> None:
+def test_a_requested_landing_continues() -> None:
     ladder = FailsafeLadder()
     ladder.order_landing()
     assert taken(ladder, T0, FLYING) == [StepChange(Failsafe.LAND, "closing"), FailsafeAction(Land())]

@@ -139,7 +139,7 @@ def test_a_take_off_has_a_time_limit_on_the_ground_but_none_in_the_air() -> None
 
 
 def test_a_take_off_of_a_vehicle_without_a_state_has_a_time_limit_too(bench: Bench) -> None:
-    """A robot's service did not answer: the repeats called it for ever, until it did."""
+    """A robot's service did not answer: the repeats called it forever, until it did."""
     pilot = bench.pilot()
     bench.driver.answers = False
     bench.driver.report(state=S.UNKNOWN)

@@ -56,7 +56,7 @@ def flown(verdict: Verdict) -> Position:
     return verdict.action
 
 
-# What is decided -------------------------------------------------------------------------------------------------
+# Decisions -------------------------------------------------------------------------------------------------------
 
 
 def test_both_speeds_are_filled_in() -> None:
@@ -224,7 +224,7 @@ def test_flown_speeds_stay_within_each_limit(
     assert action.speed * abs(end[2] - start[2]) / away <= 0.7 + 1e-9
 
 
-# What the proxy does ---------------------------------------------------------------------------------------------
+# In the proxy ----------------------------------------------------------------------------------------------------
 
 
 def placed(bench: Bench, **more: Any) -> App:

@@ -41,7 +41,7 @@ def test_two_pilots_and_three_observers(bench: Bench) -> None:
     assert bench.driver.told == [Velocity(0.5)]
 
     bob.take_authority(4)
-    assert bench.driver.told == [Velocity(0.5), Hover()]  # hover in between
+    assert bench.driver.told == [Velocity(0.5), Hover()]  # with a hover before the new pilot
     assert bob.lease > old_lease
     for app in (alice, *observers):
         (preempted,) = app.told(EventKind.AUTHORITY_PREEMPTED)
@@ -255,7 +255,7 @@ def test_feedback_says_who_is_next_until_that_one_leaves_the_queue(bench: Bench)
     carl.ask(RequestAuthority(20, queue=True))
     bench.tick()
     assert alice.last_feedback().next_owner == "bob"
-    bob.ask(ReleaseAuthority())  # which nobody is told of by an event
+    bob.ask(ReleaseAuthority())  # which causes no event
     bench.tick()
     assert alice.last_feedback().next_owner == "carl"
 

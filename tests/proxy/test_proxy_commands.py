@@ -1,4 +1,4 @@
-"""The command path: what is executed, refused and reported, and how often."""
+"""The command path: execution, refusals, and reports at a limited rate."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def test_a_landing_that_failed_once_is_not_reported_as_refused_while_the_vehicle
 def test_a_pilots_hover_and_landing_are_sent_to_a_silent_vehicle(
     bench: Bench, action: AnyAction, state: FlightState
 ) -> None:
-    """It may still receive. Only the emergency stop was sent, which is no way to bring a drone down."""
+    """It may still receive. Only the emergency stop was sent, which is not the way to bring a drone down."""
     pilot = bench.airborne()
     bench.tick()
     bench.driver.answers = False

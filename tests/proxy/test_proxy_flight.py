@@ -1,4 +1,4 @@
-"""Deciding whether a software-steered vehicle flies, and what the proxy does until it knows."""
+"""Decisions on whether a software-steered vehicle flies, and the proxy's behaviour until it knows."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ def test_the_ladder_keeps_repeating_its_landing_while_the_vehicle_is_silent(benc
 
 @pytest.mark.parametrize("noticed", [True, False])
 def test_a_pilots_landing_survives_a_broken_link(bench: Bench, noticed: bool) -> None:
-    """It ended with the link, the vehicle got a hover when that was back, and the pilot waited for ever."""
+    """It ended with the link, the vehicle got a hover when that was back, and the pilot waited forever."""
     pilot, witness = bench.airborne(), bench.join("witness")
     bench.driver.answers = False
     pilot.command(Land())
@@ -203,7 +203,7 @@ def test_an_abandoned_landing_is_not_aborted(bench: Bench, ends: str) -> None:
 def test_a_hover_that_nothing_shows_is_abandoned_after_a_minute_and_later_flights_are_left_alone(
     bench: Bench, asked: str
 ) -> None:
-    """On a link without answers, with a pilot who stayed, hovers went to whatever flew there, for ever."""
+    """On a link without answers, with a pilot who stayed, hovers went to whatever flew there, forever."""
     pilot = bench.airborne()
     be_patient(pilot)
     bench.driver.answers = False
@@ -379,7 +379,7 @@ def test_a_landing_in_progress_survives_a_broken_link_for_a_minute(bench: Bench,
 @pytest.mark.parametrize("native", [ALL, ALL - {"land"}], ids=["native", "software"])
 @pytest.mark.parametrize("found", ["flying", "landed"])
 def test_the_failsafes_own_landing_is_abandoned_after_a_minute_of_silence(native: frozenset[str], found: str) -> None:
-    """It repeated for ever: another vehicle found minutes later was landed."""
+    """It repeated forever: another vehicle found minutes later was landed."""
     with Bench(native) as bench:
         pilot, witness = bench.airborne(), bench.join("witness")
         bench.driver.answers = False
@@ -494,7 +494,7 @@ def test_automatic_commands_do_not_end_such_a_landing(bench: Bench) -> None:
 
 
 def test_a_controller_that_has_taken_the_vehicle_is_left_alone(bench: Bench) -> None:
-    """Even if the pilot's own repeats continue, which are no new decision."""
+    """Even if the pilot's own repeats continue, which are not a new decision."""
     pilot = bench.airborne()
     bench.driver.answers = False
     pilot.command(Land())
@@ -841,7 +841,7 @@ def test_software_steering_stops_if_the_vehicle_fails_to_hover_or_land(
 
 
 def test_pilots_that_hang_one_after_another_keep_it_in_the_air_no_longer_than_one(bench: Bench) -> None:
-    """Ten programs wait in the queue and hang: each gets the authority, and is never heard."""
+    """Ten programs wait in the queue and hang: each gets the authority, and sends nothing."""
     bench.airborne()
     for number in range(10):
         bench.join(f"pilot {number}").ask(RequestAuthority(16, queue=True))
@@ -882,7 +882,7 @@ def test_from_a_grant_until_the_end_of_the_flight_nothing_is_at_rest(bench: Benc
     assert bench.proxy.at_rest
 
 
-def test_a_broken_link_and_due_feedback_are_no_rest(bench: Bench) -> None:
+def test_a_broken_link_and_due_feedback_are_not_rest(bench: Bench) -> None:
     bench.driver.report(state=FlightState.LANDED)
     bench.run(1.1)
     bench.driver.link(LinkState.UP)

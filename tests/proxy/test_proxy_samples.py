@@ -67,7 +67,7 @@ def test_a_silent_vehicle_leaves_the_proxys_own_feedback(bench: Bench) -> None:
     app.sync()
     news = app.feedback[seen:]
     assert 4 <= len(news) <= 10
-    assert {feedback.captured_ns for feedback in news} == {captured}  # it is no newer than its capture time
+    assert {feedback.captured_ns for feedback in news} == {captured}  # not newer than its capture time
     bench.driver.link(LinkState.LOST, "gone")
     bench.tick()
     assert app.last_feedback().vehicle_link is LinkState.LOST

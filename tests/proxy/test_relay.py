@@ -1,4 +1,4 @@
-"""External poses: who may send them, what the driver gets, and how refusals are reported."""
+"""External poses: permissions, delivery to the driver, and reports of refusals."""
 
 from __future__ import annotations
 

@@ -430,7 +430,7 @@ def test_a_low_battery_returns_it_whatever_set_points_arrive() -> None:
 
 
 def test_no_automatic_hover_or_landing_ends_a_return_for_a_low_battery() -> None:
-    """A route's end, a page closed half-way, a key let go: only a person's own command ends it."""
+    """A route's end, a page closed half-way, a released key: only a person's own command ends it."""
     with Bench() as bench:
         pilot = away(bench)
         fall_below_the_charge_to_return_at(bench, pilot)

@@ -179,7 +179,7 @@ def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
 def against_the_net(
     by_attitude: bool, position_hz: int, gust: float, thick: float = 0.05, seconds: float = 30.0
 ) -> float:
-    """Return how far east a vehicle with lag gets that pushes at a net at x = 2 m; positions repeat in between."""
+    """Return how far east a lagging vehicle gets that pushes against a net at x = 2 m; some positions are repeated."""
     safety, x, v, far, dt = walled(None, Box((2.0, -5.0, 0.0), (2.0 + thick, 5.0, 3.0))), 0.0, 0.0, 0.0, 0.02
     for step in range(round(seconds / dt)):
         if step % (50 // position_hz) == 0:

@@ -138,7 +138,7 @@ def test_in_this_process_it_releases_everything(tmp_path: Path, monkeypatch: pyt
 def test_a_failing_process_lands_first_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The key check raised, and the process abandoned the flying vehicle, which falls if it can't hover by itself."""
+    """The key check raised, and the process abandoned the flying vehicle, which falls if it has no hover of its own."""
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
     monkeypatch.setattr("skyloop.proxy.serve.make_driver", lambda _uri: Toy(monotonic_ns))
     apps: list[App] = []

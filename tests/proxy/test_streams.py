@@ -203,7 +203,7 @@ def test_a_returning_subscriber_gets_a_key_picture_at_once(bench: Bench) -> None
     assert skipped
     app.end.subscribe(MINE, False)
     app.sync()
-    again = watcher(bench, MINE, "again")  # no frame in between: there was a subscriber each time
+    again = watcher(bench, MINE, "again")  # no frame was sent without a subscriber
     bench.clock.advance(KEY_NS / 1e9)
     (picture,) = shown(bench, again, 1)
     assert picture.key

@@ -105,7 +105,9 @@ def test_the_table_and_the_pictures(log: Log, flight: Path, other_flight: Path, 
     assert (tmp_path / "both.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_nothing_in_common_is_said_in_whole_lines(log: Log, flight: Path, tmp_path: Path) -> None:
+def test_recordings_with_nothing_in_common_are_reported_in_unbroken_lines(
+    log: Log, flight: Path, tmp_path: Path
+) -> None:
     ended = log("compare", flight, write_flight(tmp_path / "places.mcap", Plan(places=True)))
     assert "no set-point is in both at one time" in ended.out
     assert any("s compared, " in line and "they diverge at" in line for line in ended.out.splitlines())

@@ -265,7 +265,7 @@ def test_a_full_disk_leaves_an_existing_file_alone(
         ("a=b", "a=b"),
     ],
 )
-def test_no_cell_is_a_formula(tmp_path: Path, given: str, written: str) -> None:
+def test_cells_are_never_formulas(tmp_path: Path, given: str, written: str) -> None:
     table = Table("logs", {"text": np.array([given]), given: np.array([1.0])})
     export_csv({"logs": table}, tmp_path)
     with (tmp_path / "logs.csv").open(newline="", encoding="utf-8") as file:

@@ -1,7 +1,7 @@
 """Each optional field of every message is left out once, by introspection, and the message passes all its readers.
 
 A field with a default is optional: an older program does not send it, and a vehicle that does not know it leaves it
-out. New fields are tested here without another line.
+out. New fields are tested here automatically.
 """
 
 from __future__ import annotations

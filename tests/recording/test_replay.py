@@ -121,7 +121,7 @@ def test_waiting_advances_the_time(flight: Path) -> None:
         drone.frame()
         drone.next_frame()  # the last one
         with pytest.raises(NoAnswerError):
-            drone.next_frame(timeout_s=3600.0)  # none arrives after the end, and the call does not wait an hour to tell
+            drone.next_frame(timeout_s=3600.0)  # none arrives after the end, and the call does not wait an hour
         assert drone.link.vehicle == "closed"
         assert "end of the recording" in drone.link.reason
 

@@ -20,7 +20,7 @@ TAKE_OFF, LAND, EMERGENCY = 512, 0, 256
 
 
 class Pilot:
-    """Says ``REF`` and ``PCMD`` at the drone's pace while it waits, and looks at each navdata that comes."""
+    """Sends ``REF`` and ``PCMD`` at the drone's pace while it waits, and checks each navdata that arrives."""
 
     def __init__(self, ports: Ports) -> None:
         self.ports = ports

@@ -22,7 +22,7 @@ def world(**options: object) -> SimHost:
 
 
 class Cameras(threading.Thread):
-    """Sees the drone a hundred times a second, and tells whoever listens."""
+    """Measures the drone's pose a hundred times a second, and passes it to its callbacks."""
 
     def __init__(self, firmware: BetaflightFirmware) -> None:
         super().__init__(daemon=True)

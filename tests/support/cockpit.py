@@ -1,5 +1,5 @@
-"""Drones that are not there: one that hands the cockpit whatever a test puts in, through the client's own types, and a
-vehicle behind a real proxy that flies as it is told."""
+"""Fake drones: one that passes a test's samples to the cockpit through the client's own types, and a vehicle behind a
+real proxy that follows its commands."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ PATIENCE_S = 30.0
 
 
 class Listening:
-    """What registering gives back."""
+    """A registered callback, which can be cancelled."""
 
     def __init__(self, where: list[Any], function: Callable[[Any], None]) -> None:
         self._where = where
@@ -84,14 +84,12 @@ class Listening:
 
 
 class FakeStream:
-    """A camera's H.264 in one form, with which a test does what it likes."""
+    """A camera's H.264 in one format, controlled by the test."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
         self.consumers: list[Any] = []
-        self.reports: list[
-            tuple[int, bool]
-        ] = []  #: what the proxy was told: the newest picture, whether a key is needed
+        self.reports: list[tuple[int, bool]] = []  #: reports to the proxy: the newest picture, whether a key is needed
         self.seq = 100
 
     def add(self, consumer: Callable[[EncodedFrame], None], dropped: Callable[[], int]) -> None:
@@ -104,7 +102,7 @@ class FakeStream:
         self.reports.append((seq, wants_key))
 
     def encode(self, *, key: bool = False, lost: int = 0, captured_ns: int | None = None) -> EncodedFrame:
-        """The next picture comes, after some that are lost on the way."""
+        """Deliver the next picture, after losing some on the way."""
         self.seq += 1 + lost
         now = time.monotonic_ns()
         size = (round(64 * self.request.scale), round(48 * self.request.scale))
@@ -116,7 +114,7 @@ class FakeStream:
 
 
 class FakeDrone:
-    """As much of a drone as the cockpit looks at."""
+    """The parts of a drone that the cockpit uses."""
 
     name = "alpha"
     uri = "sim://?seed=1"
@@ -136,8 +134,8 @@ class FakeDrone:
         self.feedback_listeners: list[Any] = []
         self.command_listeners: list[Any] = []
         self.log_listeners: list[Any] = []
-        self.requests: list[tuple[str, dict[str, Any]]] = []  #: cameras that were subscribed to, and how
-        self.streams: list[FakeStream] = []  #: as H.264, in the order in which they were first asked for
+        self.requests: list[tuple[str, dict[str, Any]]] = []  #: subscribed cameras, with their options
+        self.streams: list[FakeStream] = []  #: H.264 streams in the order of their first request
         self._state = SimpleNamespace(video=SimpleNamespace(stream=self._stream))
         self.clock_offset_ns = 0
         self.closed = False
@@ -182,7 +180,7 @@ class FakeDrone:
             self.streams.append(known)
         return known
 
-    # What a test does ------------------------------------------------------------------------------------------
+    # For tests -------------------------------------------------------------------------------------------------
 
     def show(
         self,
@@ -191,7 +189,7 @@ class FakeDrone:
         image: np.ndarray | None = None,
         captured_ns: int | None = None,
     ) -> Frame:
-        """The camera takes a picture, all of one shade unless given."""
+        """Take a picture with the camera, of a single shade unless an image is given."""
         width, height = self._size
         pixels = np.full((height, width, 3), shade, np.uint8) if image is None else image
         self._seq += 1
@@ -214,7 +212,7 @@ class FakeDrone:
 
 
 def flying(**values: Any) -> Feedback:
-    """Feedback of a vehicle in the air."""
+    """Return the feedback of a vehicle in the air."""
     known: dict[str, Any] = {
         "captured_ns": time.monotonic_ns(),
         "state": FlightState.FLYING,
@@ -234,7 +232,7 @@ def flying(**values: Any) -> Feedback:
 
 
 class Flyer(Driver):
-    """A vehicle with a camera ``front`` that flies as it is told, at once, and knows where it is."""
+    """A vehicle with a camera ``front`` that follows each command at once and knows its position."""
 
     PERIOD_S = 0.02
 
@@ -242,9 +240,9 @@ class Flyer(Driver):
         super().__init__(VehicleUri("fake", text=uri))
         self.state = FlightState.LANDED
         self.applied: list[AnyAction] = []
-        self.deaf = False  #: does nothing of what it is told
-        self.others = ""  #: the mode that somebody else chose, until it is steered from here again
-        self.taken: list[AnyAction] = []  #: what took it back
+        self.deaf = False  #: ignores all commands
+        self.others = ""  #: the mode that someone else chose, until the vehicle is steered from here again
+        self.taken: list[AnyAction] = []  #: actions that took it back
         self.battery = 0.9
         self.place = [0.0, 0.0, 0.0]
         self.yaw = 0.0
@@ -254,7 +252,7 @@ class Flyer(Driver):
         self._thread: threading.Thread | None = None
 
     def capabilities(self) -> Capabilities:
-        actions = frozenset(ACTION_NAMES.values()) - {"position"}  # the proxy flies it there
+        actions = frozenset(ACTION_NAMES.values()) - {"position"}  # which the proxy emulates
         return Capabilities("fake", actions, (CameraInfo("front", 32, 24, 50.0),))
 
     def _open(self, sink: Sink) -> None:
@@ -264,7 +262,7 @@ class Flyer(Driver):
         self._thread.start()
 
     def link(self, state: LinkState) -> None:
-        """Tell this of the vehicle's link."""
+        """Report this state of the vehicle's link."""
         assert self._sink is not None
         self._sink.link(state, "told so")
 
@@ -316,7 +314,7 @@ class Node:
     def __init__(self, name: str = "alpha", **options: Any) -> None:
         self.name = name
         self.flyer = Flyer(**options)
-        self.stops_lost = 0  #: so many packets of an emergency stop are lost on their way
+        self.stops_lost = 0  #: number of emergency stop packets to lose on the way
         self._server = MemoryServer(name)
         self._proxy = Proxy(self.flyer, self._server, name=name)
         self._proxy.start()
@@ -350,7 +348,7 @@ class Node:
 
 
 class Nodes:
-    """Finds the nodes that are up."""
+    """A finder that finds the running nodes."""
 
     def __init__(self, *nodes: Node) -> None:
         self.nodes = list(nodes)
@@ -366,7 +364,7 @@ class Nodes:
 
 
 class FakeRecorder:
-    """Writes a small file, and says that it records."""
+    """Writes a small file and reports that it is recording."""
 
     def __init__(self, drones: Sequence[str], folder: Path) -> None:
         self.path = folder / f"{'-'.join(drones)}.mcap"
@@ -384,12 +382,12 @@ class FakeRecorder:
 
 
 def this_user(role: Role = Role.PILOT) -> OpenGate:
-    """Everybody is this user."""
+    """Treat every caller as this user."""
     return OpenGate(role, uid_of=lambda *_: os.geteuid())
 
 
 def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
-    """Of drones that are there at once, and for ever."""
+    """Return a fleet of drones that are found at once and never lost."""
 
     def dial(_: ClientHandler) -> TransportClient:
         raise LinkError("nobody flies this one")
@@ -409,7 +407,7 @@ def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
 def cockpit(
     fleet: Fleet, gate: Gate | None = None, recordings: Recordings | None = None, **options: Any
 ) -> Iterator[TestClient]:
-    """The cockpit's pages, without a server."""
+    """Return the cockpit's pages without a server."""
     names = own_names("127.0.0.1", 8123)
     app = create_app(fleet, recordings or Recordings(Path("nowhere")), names, gate or this_user(), **options)
     with TestClient(app, base_url=OWN) as client:
@@ -421,7 +419,7 @@ def open_socket(client: TestClient, path: str, **headers: str) -> WebSocketTestS
 
 
 def until(condition: Callable[[], Any], what: str = "it happened") -> None:
-    """Wait for what nothing signals."""
+    """Wait for a condition that nothing signals."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, f"waited {PATIENCE_S} s, still not true: {what}"

@@ -30,7 +30,7 @@ class Page:
         self.told: list[dict[str, Any]] = []
 
     def say(self, do: str, **values: Any) -> None:
-        """What a page says that sees and hears all: it has the cockpit's clock, being in one process with it."""
+        """Send a message as an up-to-date page; it uses the cockpit's clock, because both are in one process."""
         now_s = time.monotonic()
         seen = {"seen_s": now_s} if do == "ping" else {}
         self.socket.send_json({"do": do, "at_s": now_s, **seen, **values})

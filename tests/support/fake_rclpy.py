@@ -1,4 +1,4 @@
-"""rclpy and its messages, as far as Skyloop uses them, without DDS: what is published is kept, and a test delivers."""
+"""The parts of rclpy and its messages that Skyloop uses, without DDS: tests read and deliver the messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 
 class Message:
-    """Any message: fields appear when they are used."""
+    """A message of any type, whose fields are created on first use."""
 
     def __init__(self, **fields: Any) -> None:
         self.__dict__.update(fields)
@@ -53,7 +53,7 @@ class Logger:
 
 
 class Future:
-    """Of a call, answered by the test."""
+    """The future of a service call, answered by the test."""
 
     def __init__(self) -> None:
         self.callback: Callable[[Any], None] | None = None
@@ -179,7 +179,7 @@ class Executor:
 
 
 class Fake:
-    """What a test finds: the nodes, by their names."""
+    """What a test can access: the nodes by name."""
 
     def __init__(self) -> None:
         self.nodes: dict[str, Node] = {}
@@ -200,7 +200,7 @@ def _parameter(name: str, value: Any = None) -> Any:
 
 @pytest.fixture
 def rclpy(monkeypatch: pytest.MonkeyPatch) -> Fake:
-    """Install the fake, and return what it makes."""
+    """Install the fake, and return its nodes."""
     fake = Fake()
 
     class Context:

@@ -1,4 +1,4 @@
-"""In place of Rerun's module, of 790 MB: keeps what is logged, with its time. What it draws is its own affair."""
+"""A fake of Rerun's module, which has 790 MB: stores what is logged, with its time, and draws nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 
 class Made:
-    """An archetype, or any other object, as it was made."""
+    """An archetype or any other object, with its arguments."""
 
     def __init__(self, kind: str, *values: Any, **named: Any) -> None:
         self.kind = kind
@@ -23,7 +23,7 @@ class Stream:
 
     def __init__(self, application: str, *, recording_id: str) -> None:
         self.recording_id = recording_id
-        self.logged: list[tuple[str, int | None, Made]] = []  #: entity, time or None for what is static, what
+        self.logged: list[tuple[str, int | None, Made]] = []  #: entity, time (None if static), object
         self.target = ""
         self.closed = False
         self.broken = False
@@ -65,7 +65,7 @@ class Stream:
 
 
 class Module(ModuleType):
-    """Makes anything that is asked for, and keeps the streams."""
+    """Creates any requested object, and stores the streams."""
 
     def __init__(self, name: str, streams: list[Stream]) -> None:
         super().__init__(name)
@@ -93,7 +93,7 @@ class Module(ModuleType):
 
 
 def install(monkeypatch: pytest.MonkeyPatch) -> list[Stream]:
-    """Put it in place; return the streams, which are made later."""
+    """Install the fake; return the list to which streams are added."""
     streams: list[Stream] = []
     module = Module("rerun", streams)
     module.blueprint = Module("rerun.blueprint", streams)  # type: ignore[attr-defined]

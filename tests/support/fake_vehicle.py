@@ -1,4 +1,4 @@
-"""A vehicle for tests: it does at once what it is told, and tells its state at a steady rate."""
+"""A vehicle for tests, which follows commands at once and reports its state at a steady rate."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ NEXT: dict[type[Action], FlightState] = {
 
 
 class FakeVehicle(Driver):
-    """Has a camera ``front`` of 32 × 24 pixels that shows the frame's number."""
+    """A vehicle with a camera ``front`` of 32 × 24 pixels that shows the frame's number."""
 
     def __init__(self, *, can_fly: bool = True) -> None:
         super().__init__(VehicleUri("fake", text="fake://test"))
@@ -54,7 +54,7 @@ class FakeVehicle(Driver):
         self.applied: list[AnyAction] = []
         self.link_state = LinkState.UP
         self.position_m: Vector | None = None
-        self.mute = threading.Event()  #: tells nothing while set
+        self.mute = threading.Event()  #: reports nothing while set
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 

@@ -1,4 +1,4 @@
-"""Pictures that carry their number, as H.264, and somebody who shows them at their times."""
+"""Pictures that show their number, as H.264, and a projector that sends them at their times."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Pixels = NDArray[np.uint8]
 
 
 def picture_of(number: int) -> Pixels:
-    """Shape (height, width, 3): above, a stripe for each bit of the number; below, something that takes bytes."""
+    """Return a picture, (height, width, 3): a stripe for each bit of the number, above detail that takes bytes."""
     pixels = np.random.default_rng(number).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
     for bit in range(BITS):
         pixels[: HEIGHT // 2, bit * STRIPE : (bit + 1) * STRIPE] = 220 if number >> bit & 1 else 30
@@ -28,13 +28,13 @@ def picture_of(number: int) -> Pixels:
 
 
 def number_of(pixels: Pixels) -> int:
-    """What the stripes say."""
+    """Return the number that the stripes show."""
     stripes = pixels[4 : HEIGHT // 2 - 4].reshape(-1, BITS, STRIPE, 3).mean(axis=(0, 2, 3))
     return sum(1 << bit for bit, level in enumerate(stripes) if level > 125)
 
 
 class Film:
-    """Encodes the next picture."""
+    """Encodes one picture after another."""
 
     def __init__(self) -> None:
         self._encoder = Encoder(Format("h264", WIDTH, HEIGHT, 0), FPS, 2000, group=GROUP)
@@ -48,9 +48,9 @@ class Film:
 
 
 class Projector:
-    """Gives one picture after the other to ``send``, with its stamp [s], at 25 a second until it is closed.
+    """Passes pictures to ``send``, each with its stamp [s], 25 times a second until it is closed.
 
-    ``taken_ns`` has when each was taken, by its number.
+    ``taken_ns`` holds when each was taken, by number.
     """
 
     def __init__(self, send: Callable[[bytes, float], None], film: Film | None = None) -> None:
@@ -58,7 +58,7 @@ class Projector:
         self._film = film or Film()
         self._ended = threading.Event()
         self.paused = threading.Event()
-        self.spoilt = threading.Event()  #: pictures are noise
+        self.spoilt = threading.Event()  #: whether pictures are noise
         self.taken_ns: dict[int, int] = {}
         self._thread = threading.Thread(target=self._run, daemon=True)
 

@@ -1,4 +1,4 @@
-"""The pages for people, taken apart: blocks of code, code in the text, sections."""
+"""Parts of the documentation's pages: code blocks, code in the text, sections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PAGES = sorted(
         *(ROOT / "docs").rglob("*.md"),
     ]
 )
-#: A block is left out of the tests only by such a comment right above it, with the reason.
+#: Only such a comment right above a block, with the reason, excludes the block from the tests.
 _SKIPPED = re.compile(r"<!-- not run: (.+) -->")
 _BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
@@ -23,17 +23,17 @@ class Block:
     """A fenced block of code."""
 
     page: Path
-    line: int  #: of its first line of code
+    line: int  #: number of its first line of code
     language: str
     code: str
-    skipped: str  #: why it is not run; empty if it is
+    skipped: str  #: why it is not run; empty if it is run
 
     def __str__(self) -> str:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 
 def blocks(*languages: str) -> list[Block]:
-    """All blocks in these languages, page by page."""
+    """Return all blocks in these languages, page by page."""
     return [
         block
         for page in PAGES
@@ -53,17 +53,17 @@ def _blocks(page: Path, text: str) -> list[Block]:
 
 
 def prose(page: Path) -> str:
-    """A page without its blocks of code."""
+    """Return a page without its code blocks."""
     return _BLOCK.sub("", page.read_text())
 
 
 def spans(page: Path) -> list[str]:
-    """The code within a page's text."""
+    """Return the code within a page's text."""
     return [" ".join(span.split()) for span in re.findall(r"`([^`]+)`", prose(page))]
 
 
 def section(page: str, heading: str) -> str:
-    """What stands under a heading of a page, up to the next one of the same rank or higher."""
+    """Return the text under a heading of a page, up to the next one of the same or a higher level."""
     text = (ROOT / page).read_text()
     rank = len(heading) - len(heading.lstrip("#"))
     found = re.search(rf"^{re.escape(heading)}$\n(.*?)(?=^#{{1,{rank}}} |\Z)", text, re.MULTILINE | re.DOTALL)
@@ -72,7 +72,7 @@ def section(page: str, heading: str) -> str:
 
 
 def rows(table: str) -> list[list[str]]:
-    """The cells of the tables in a text, without the backquotes around whole cells; heads and rulers are left out."""
+    """Return the cells of the tables in a text, without headers, rulers and the backquotes around whole cells."""
     found: list[list[str]] = []
     lines = table.splitlines()
     for number, line in enumerate(lines):

@@ -1,4 +1,4 @@
-"""Real proxies and applications as processes, in a directory of sockets of their own."""
+"""Real proxies and applications as processes, with a separate directory for their sockets."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from typing import IO
 import pytest
 
 STARTS_WITHIN_S = 20.0
-PILOTS = str(Path(__file__).parents[1] / "integration" / "processes" / "pilots.py")  #: applications to start by name
+PILOTS = str(Path(__file__).parents[1] / "integration" / "processes" / "pilots.py")  #: applications, started by name
 
 
 @pytest.fixture(autouse=True)
 def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A directory of sockets for this test alone; with a short path, as those of sockets must be."""
+    """Provide a directory for this test's sockets, with a short path, because socket paths must be short."""
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
         yield Path(folder) / "run"
 
 
 class Process:
-    """A child whose lines can be waited for. Ended by its own number, whatever happens.
+    """A child process on whose output a test can wait. It is always ended, by its process id.
 
-    ``prefix`` is put before the interpreter and becomes it, such as what enters a namespace.
+    ``prefix`` is put before the interpreter, for example to enter a namespace, and must exec it.
     """
 
     def __init__(self, *arguments: str, prefix: Sequence[str] = ()) -> None:
@@ -46,7 +46,7 @@ class Process:
         return self._popen.pid
 
     def until(self, words: str, timeout_s: float = STARTS_WITHIN_S) -> None:
-        """Read until it has said this."""
+        """Read until the output contains these words."""
         stream: IO[bytes] | None = self._popen.stdout
         assert stream is not None
         deadline = time.monotonic() + timeout_s
@@ -73,7 +73,7 @@ class Process:
 
 
 def in_terminal(*words: str, columns: int) -> str:
-    """Run a command of ``skyloop`` in a terminal this wide, to its good end; what the terminal showed."""
+    """Run a ``skyloop`` command successfully in a terminal of this width; return what the terminal showed."""
     leader, follower = os.openpty()
     with subprocess.Popen(
         [sys.executable, "-m", "skyloop", *words],
@@ -86,7 +86,7 @@ def in_terminal(*words: str, columns: int) -> str:
         try:
             while said := os.read(leader, 4096):
                 text += said
-        except OSError:  # how a terminal ends whose other end is closed
+        except OSError:  # the other end of the terminal is closed
             pass
         assert process.wait(20) == 0, text.decode()
     os.close(leader)
@@ -95,7 +95,7 @@ def in_terminal(*words: str, columns: int) -> str:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., Process]]:
-    """Starts Python processes that end with the test."""
+    """Provide a function that starts Python processes, which end with the test."""
     running: list[Process] = []
 
     def begin(*arguments: str) -> Process:
@@ -110,7 +110,7 @@ def start() -> Iterator[Callable[..., Process]]:
 
 @pytest.fixture
 def proxy(start: Callable[..., Process]) -> Callable[..., Process]:
-    """Starts a proxy and waits until it serves."""
+    """Provide a function that starts a proxy and waits until it serves."""
 
     def begin(uri: str = "sim://?world=empty&cameras=none", name: str = "alpha") -> Process:
         process = start("-m", "skyloop", "proxy", uri, "--name", name)
@@ -121,7 +121,7 @@ def proxy(start: Callable[..., Process]) -> Callable[..., Process]:
 
 
 def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 30.0) -> float:
-    """Wait in small steps for what nothing signals, never longer than this; how long it took [s]."""
+    """Poll for a condition that nothing signals, up to this time; return how long it took [s]."""
     begin = time.monotonic()
     while not condition():
         assert time.monotonic() - begin < timeout_s, f"not within {timeout_s} s: {what}"
@@ -130,7 +130,7 @@ def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 30.0
 
 
 def skyloop_command(*words: str, code: int = 0) -> str:
-    """Run a command of ``skyloop`` to its end, with this exit code; what it said."""
+    """Run a ``skyloop`` command, check its exit code, and return its output."""
     ended = subprocess.run(
         [sys.executable, "-m", "skyloop", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=60
     )

@@ -1,5 +1,5 @@
-"""A proxy on a bench: a vehicle that does what it is told at once, applications over the memory transport, and a clock
-that stands still. A Ping's answer shows that everything sent before it was dealt with and everything told was heard."""
+"""A proxy on a bench: a vehicle that follows commands at once, applications over the memory transport, and a manual
+clock. The reply to a Ping shows that everything sent before it was handled and everything published was received."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ _NEXT = {
 
 
 class FakeDriver(Driver):
-    """Records what it is told, and shows it in its feedback from inside of the call."""
+    """Records its commands, and shows their effect in feedback before the call returns."""
 
     def __init__(self, clock: Clock, actions: Iterable[str] = ALL, parameters: Iterable[Parameter] = ()) -> None:
         super().__init__(VehicleUri("fake", text="fake://"))
@@ -88,12 +88,12 @@ class FakeDriver(Driver):
         self.sink: Sink | None = None
         self.told: list[AnyAction] = []
         self.now = Feedback(captured_ns=0, state=FlightState.LANDED, battery=0.9, altitude_m=1.0)
-        self.fail: set[str] = set()  #: calls that raise now
+        self.fail: set[str] = set()  #: calls that raise
         self.native = list(parameters)
         self.while_setting: Callable[[], None] = lambda: None
         self.closed = False
-        self.left = ""  #: what others made of the vehicle
-        self.refuses = ""  #: why the software autopilot must not begin, and what ``apply`` raises
+        self.left = ""  #: what others made the vehicle do
+        self.refuses = ""  #: why the software autopilot must not start, which ``apply`` raises
         self.repeats = 0
         self.answers = True  #: whether feedback follows a command
         self._actions = frozenset(actions)
@@ -112,7 +112,7 @@ class FakeDriver(Driver):
         return value
 
     def report(self, **changes: Any) -> None:
-        """Tell this of the vehicle now."""
+        """Report feedback with these changes."""
         fields = {name: getattr(self.now, name) for name in self.now.__struct_fields__} | changes
         self.now = Feedback(**fields | {"captured_ns": self.clock()})
         assert self.sink is not None
@@ -158,7 +158,7 @@ class FakeDriver(Driver):
 
 
 class App:
-    """One application, told everything."""
+    """One application, subscribed to everything."""
 
     def __init__(self, dial: Dialer, clock: Clock) -> None:
         self.clock = clock
@@ -201,10 +201,10 @@ class App:
     def closed(self, reason: str) -> None:
         self.closed_by.put(reason)
 
-    # What tests do with it
+    # For tests
 
     def ask(self, body: AnyRequest) -> AnyReply:
-        """One request and its answer; everything told before the answer has been heard then."""
+        """Send a request and return the answer, by when everything published before it has been received."""
         return self.answer(self.post(body))
 
     def post(self, body: AnyRequest) -> int:
@@ -213,27 +213,27 @@ class App:
         return self._ids
 
     def reserve(self) -> int:
-        """Return the number of a request that is lost on the way."""
+        """Return the number of a request that was lost on the way."""
         self._ids += 1
         return self._ids
 
     def repeat(self, number: int, body: AnyRequest) -> None:
-        """Send a request once more under its number, as the library does while no answer comes."""
+        """Send a request again under its number, as the library does while no answer arrives."""
         assert self.end.send(encode(Request(number, body)))
 
     def answer(self, number: int) -> AnyReply:
         reply = self._replies.get(timeout=WAIT_S)
-        while reply.id in self._asked_again and reply.id < number:  # both answers arrived after all
+        while reply.id in self._asked_again and reply.id < number:  # both answers arrived
             reply = self._replies.get(timeout=WAIT_S)
         assert reply.id == number
         return reply.body
 
     def sync(self) -> None:
-        """Wait until the proxy has handled all that was sent; ask again once, as the library does for a lost packet."""
+        """Wait until the proxy has handled everything sent; ask twice, as the library does if a packet is lost."""
         number = self.post(Ping(1))
         with self._replies.not_empty:
             answered = self._replies.queue or self._replies.not_empty.wait(1.0)
-        if not answered:  # a burst of feedback had filled the connection, and the answer was dropped
+        if not answered:  # a burst of feedback filled the connection, and the answer was dropped
             self.repeat(number, Ping(1))
             self._asked_again.add(number)
         assert isinstance(self.answer(number), Pong)
@@ -251,7 +251,7 @@ class App:
         return self.lease
 
     def command(self, action: AnyAction, *, repeat: bool = False, sync: bool = True, **changes: Any) -> Command:
-        """Send a command; ``repeat`` keeps the intent, ``changes`` are fields that are to be wrong."""
+        """Send a command; ``repeat`` keeps the intent, ``changes`` replaces fields."""
         self.seq += 1
         self.intent += not repeat
         fields = {"seq": self.seq, "lease": self.lease, "intent": self.intent, "sent_ns": self.clock()} | changes
@@ -262,12 +262,12 @@ class App:
         return command
 
     def told(self, kind: EventKind) -> list[Event]:
-        """The events of a kind so far."""
+        """Return the events of a kind so far."""
         self.sync()
         return [event for event in self.events if event.kind is kind]
 
     def refusals(self) -> list[str]:
-        """The reasons for which commands of this application were refused, as told."""
+        """Return the reported reasons why commands of this application were refused."""
         told = self.told(EventKind.COMMAND_REFUSED)
         return [str(event.data["reason"]) for event in told if event.app == self.name]
 
@@ -291,12 +291,12 @@ class Bench:
             transport = memory, memory.dial
         self.server, self.dial = transport
         self.driver = FakeDriver(self.clock, actions, parameters)
-        self.slept_ns = 0  #: for how long the computer has slept
+        self.slept_ns = 0  #: how long the computer has slept
         self.proxy = Proxy(
             self.driver, self.server, name="bench", clock=self.clock, ticker=False, slept=lambda: self.slept_ns
         )
         self.apps: list[App] = []
-        self.events: list[Event] = []  #: published, whether or not they arrive anywhere
+        self.events: list[Event] = []  #: all published events, even those that no one receives
         self._publish, self.proxy.events._publish = self.proxy.events._publish, self._publish_event
 
     def _publish_event(self, topic: str, packet: bytes) -> int:
@@ -306,7 +306,7 @@ class Bench:
         return self._publish(topic, packet)
 
     def published(self, kind: EventKind) -> list[Event]:
-        """The events of a kind so far."""
+        """Return the events of a kind so far."""
         return [event for event in self.events if event.kind is kind]
 
     def __enter__(self) -> Bench:
@@ -319,7 +319,7 @@ class Bench:
             app.end.close()
 
     def stranger(self) -> App:
-        """A connection without Hello."""
+        """Return a connection without Hello."""
         app = App(self.dial, self.clock)
         self.apps.append(app)
         return app
@@ -335,13 +335,13 @@ class Bench:
         return app
 
     def airborne(self, name: str = "pilot", priority: int = 16) -> App:
-        """A pilot whose vehicle hovers, with the record of the driver cleared."""
+        """Return a pilot whose vehicle hovers, and clear the driver's record."""
         app = self.pilot(name, priority)
         self.take_off(app)
         return app
 
     def take_off(self, app: App) -> None:
-        """Begin a flight of this pilot, up to where the vehicle hovers, and clear the record of the driver."""
+        """Take off with this pilot until the vehicle hovers, and clear the driver's record."""
         app.command(Takeoff())
         deadline = time.monotonic() + WAIT_S
         while Takeoff() not in self.driver.told:  # a datagram may be lost
@@ -352,7 +352,7 @@ class Bench:
         self.driver.told.clear()
 
     def move(self, position_m: tuple[float, float, float], **more: Any) -> None:
-        """Report the vehicle at another place, and before that on the way there: its position does not jump."""
+        """Report the vehicle at another position, after positions on the way, so that it does not jump."""
         start = self.driver.now.position_m or position_m
         steps = math.ceil(math.dist(start, position_m) / 0.9)
         for step in range(1, steps + 1):
@@ -361,7 +361,7 @@ class Bench:
             self.tick()
 
     def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
-        """Let time pass in steps of 20 ms, the proxy's tick after each, then ``each``."""
+        """Advance time in steps of 20 ms, each followed by the proxy's tick and ``each``."""
         for _ in range(round(seconds / 0.02)):
             self.clock.advance(0.02)
             self.proxy.tick(self.clock())

@@ -1,4 +1,4 @@
-"""Small recordings, written with the plain MCAP library by what the layout says."""
+"""Small recordings, written with the plain MCAP library according to the documented layout."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ from skyloop.recording.layout import (
 )
 
 MS = 1_000_000
-BEGIN_NS = 5_000_000_000_000  #: of the flight, on the proxy's clock
-UNIX_NS = 1_760_000_000_000_000_000  #: the same moment
+BEGIN_NS = 5_000_000_000_000  #: start of the flight on the proxy's clock
+UNIX_NS = 1_760_000_000_000_000_000  #: the same moment in Unix time
 WIDTH, HEIGHT = 64, 48
 INTRINSICS = Intrinsics(60.0, 60.0, 31.5, 23.5)
 CAPABILITIES = Capabilities(
@@ -77,28 +77,28 @@ CAPABILITIES = Capabilities(
 
 @dataclass
 class Plan:
-    """What a recording is to hold."""
+    """The contents of a recording."""
 
     seconds: float = 2.0
     feedback_ms: int = 20
-    frame_ms: int = 100  #: 0: no frames
+    frame_ms: int = 100  #: 0 for no frames
     command_ms: int = 50
-    gain: float = 1.0  #: of the commanded speeds
+    gain: float = 1.0  #: factor of the commanded speeds
     drone: str = "alpha"
     png: bool = False
-    lossy: bool = True  #: tells of drops, and has a gap in the feedback
+    lossy: bool = True  #: whether it reports drops and has a gap in the feedback
     capabilities: Capabilities = CAPABILITIES
     compression: CompressionType = CompressionType.ZSTD
     chunk_size: int = 16 * 1024
     closed: bool = True
-    places: bool = False  #: it flies to a place instead of by velocity
-    shift_ns: int = 0  #: of the commands, on the proxy's clock
-    extra: Callable[[int], Feedback | None] = field(default=lambda at_ms: None)  #: replaces the feedback of a time
+    places: bool = False  #: whether it flies to a position instead of by velocity
+    shift_ns: int = 0  #: shift of the commands on the proxy's clock
+    extra: Callable[[int], Feedback | None] = field(default=lambda at_ms: None)  #: replaces the feedback at a time
     packed: Callable[[int], bytes | None] = field(default=lambda number: None)  #: replaces the file of a picture
 
 
 def state_at(seconds: float, t: float) -> FlightState:
-    """Landed, taking off, flying, landing, landed."""
+    """Return the state at a time: landed, taking off, flying, landing, landed."""
     share = t / seconds
     if share < 0.1 or share > 0.95:
         return FlightState.LANDED
@@ -108,7 +108,7 @@ def state_at(seconds: float, t: float) -> FlightState:
 
 
 def feedback_at(plan: Plan, at_ms: int, seq: int) -> Feedback:
-    """A circle of 1 m about (1, 2), climbing to 1.2 m."""
+    """Return feedback on a circle of 1 m around (1, 2) that climbs to 1.2 m."""
     t = at_ms / 1000
     angle = t * 1.2
     high = 1.2 * max(0.0, min(1.0, (t / plan.seconds - 0.1) / 0.15, (0.95 - t / plan.seconds) / 0.15))
@@ -147,14 +147,14 @@ def action_at(plan: Plan, at_ms: int) -> AnyAction:
 
 
 def picture_at(number: int) -> np.ndarray:
-    """A grey ramp with a bright column that moves."""
+    """Return a grey ramp with a bright column that moves."""
     image = np.repeat(np.linspace(20, 120, WIDTH, dtype=np.uint8)[None, :, None], HEIGHT, 0).repeat(3, 2)
     image[:, (number * 3) % WIDTH] = (40, 200, 250)
     return image
 
 
 class Tape:
-    """An MCAP file in the making."""
+    """An MCAP file that is being written."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         self._plan = plan
@@ -200,7 +200,7 @@ class Tape:
 
 
 def write_flight(path: Path, plan: Plan | None = None) -> Path:
-    """A flight in which everything comes once at least."""
+    """Write a flight in which every kind of sample occurs."""
     plan = plan or Plan()
     tape = Tape(path, plan)
     for parameter in (

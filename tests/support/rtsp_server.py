@@ -1,6 +1,6 @@
-"""A camera that speaks RTSP, for tests: one H.264 stream, over TCP or UDP, to any number of clients.
+"""An RTSP camera for tests: one H.264 stream, over TCP or UDP, to any number of clients.
 
-As much of RTSP 1.0 (RFC 2326) as a client needs to play: OPTIONS, DESCRIBE, SETUP, PLAY, GET_PARAMETER, TEARDOWN. The
+The part of RTSP 1.0 (RFC 2326) that a client needs: OPTIONS, DESCRIBE, SETUP, PLAY, GET_PARAMETER, TEARDOWN. The
 pictures travel as RTP (RFC 3550, 5.1), in single NAL units and in fragments, FU-A (RFC 6184, 5.6 and 5.8), each with
 a header of four bytes on the RTSP connection itself (RFC 2326, 10.12), or as datagrams. There is no RTCP.
 """
@@ -17,7 +17,7 @@ from contextlib import suppress
 from typing import Final
 
 HOST: Final = "127.0.0.1"
-CLOCK_HZ: Final = 90_000  #: of stamps, RFC 6184, 8.2.1
+CLOCK_HZ: Final = 90_000  #: clock of the stamps, RFC 6184, 8.2.1
 PAYLOAD_TYPE: Final = 96
 _SSRC: Final = 0x5C410000
 _FU_A: Final = 28
@@ -27,12 +27,12 @@ _SEND_S: Final = 5.0
 
 
 def units_of(stream: bytes) -> list[bytes]:
-    """The NAL units of a stream in Annex B form."""
+    """Return the NAL units of a stream in Annex B form."""
     return [unit for unit in _START_CODE.split(stream) if unit]
 
 
 def payloads_of(unit: bytes, most: int) -> Iterator[bytes]:
-    """A NAL unit as payloads of at most so many bytes: by itself, or in fragments."""
+    """Return a NAL unit as payloads of at most this many bytes: a single one, or fragments."""
     if len(unit) <= most:
         yield unit
         return
@@ -44,14 +44,14 @@ def payloads_of(unit: bytes, most: int) -> Iterator[bytes]:
 
 
 class RtpPacker:
-    """Packs pictures as RTP with payloads of at most ``most`` bytes, numbered."""
+    """Packs pictures as numbered RTP packets with payloads of at most ``most`` bytes."""
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._sequence = 0
 
     def packets(self, picture: bytes, stamp_s: float) -> list[bytes]:
-        """One picture in Annex B form. The marker stands on its last packet, RFC 6184, 5.1."""
+        """Return the packets of a picture in Annex B form; the last one has the marker, RFC 6184, 5.1."""
         payloads = [payload for unit in units_of(picture) for payload in payloads_of(unit, self._most)]
         stamp = round(stamp_s * CLOCK_HZ) & 0xFFFFFFFF
         made = []
@@ -77,7 +77,7 @@ class RtspSession:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
     def serve(self) -> None:
-        """Until the client goes, or the server."""
+        """Serve until the client or the server ends."""
         held = b""
         self._connection.settimeout(None)
         while data := self._connection.recv(65536):
@@ -111,7 +111,7 @@ class RtspSession:
             self._udp.close()
 
     def _send_packet(self, packet: bytes) -> None:
-        with suppress(OSError):  # of a client that goes
+        with suppress(OSError):  # the client has left
             if self._udp is not None:
                 self._udp.send(packet)
                 return
@@ -119,7 +119,7 @@ class RtspSession:
                 self._connection.sendall(b"$\0" + struct.pack("!H", len(packet)) + packet)
 
     def _answer(self, request: str) -> bool:
-        """False if the client is done."""
+        """Answer a request; return whether the session continues."""
         first, *lines = request.split("\r\n")
         method, url, _ = (*first.split(" "), "", "")[:3]
         fields = {name.strip().lower(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
@@ -164,7 +164,7 @@ class RtspSession:
             self._reply(sequence, "461 Unsupported Transport")
 
     def _reply(self, sequence: str, status: str, *fields: str) -> None:
-        """The last field may be a body: it is one if it has several lines."""
+        """Send a reply; a last field of several lines is the body."""
         body = fields[-1] if fields and "\r\n" in fields[-1] else ""
         lines = [f"RTSP/1.0 {status}", f"CSeq: {sequence}", *(fields[:-1] if body else fields)]
         if body:
@@ -174,15 +174,15 @@ class RtspSession:
 
 
 class RtspServer:
-    """Starts and stops any number of times, on one port. ``parameters``: a key picture, whose SPS and PPS are told.
+    """Starts and stops any number of times, on one port. The SDP has the SPS and PPS of the key picture ``parameters``.
 
-    ``most``: bytes of an RTP payload. ``user``: ``NAME:PASSWORD`` that a client must give.
+    ``most``: maximum bytes of an RTP payload. ``user``: ``NAME:PASSWORD`` that a client must give.
     """
 
     def __init__(self, parameters: bytes = b"", *, ways: tuple[str, ...] = ("tcp", "udp"), user: str = "") -> None:
         self.ways = ways
         self.path = "/live"
-        self.most = 300  # small, so that small pictures come in fragments too
+        self.most = 300  # small, so that small pictures are fragmented too
         self.requests: list[str] = []
         self._user = user
         self._parameters = [unit for unit in units_of(parameters) if unit[0] & 31 in (_SPS, _PPS)]
@@ -198,7 +198,7 @@ class RtspServer:
 
     @property
     def sdp(self) -> str:
-        """RFC 4566, with the parameters of RFC 6184, 8.1."""
+        """Return the SDP (RFC 4566) with the parameters of RFC 6184, 8.1."""
         told = ",".join(base64.b64encode(unit).decode() for unit in self._parameters)
         known = f";sprop-parameter-sets={told}" if told else ""
         return (
@@ -222,7 +222,7 @@ class RtspServer:
         thread.start()
 
     def stop(self, *, abruptly: bool = False) -> None:
-        """``abruptly``: connections are reset, as when a process is killed with data unread."""
+        """Stop; ``abruptly`` resets connections, as when a process is killed with unread data."""
         if self._listener is not None:
             with suppress(OSError):
                 self._listener.shutdown(socket.SHUT_RDWR)
@@ -237,7 +237,7 @@ class RtspServer:
             assert not thread.is_alive()
 
     def send(self, picture: bytes, stamp_s: float) -> None:
-        """A picture in Annex B form to everybody who plays."""
+        """Send a picture in Annex B form to every playing client."""
         with self._changed:
             playing = [session for session in self._sessions if session.playing]
         for session in playing:

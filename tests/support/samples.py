@@ -1,4 +1,4 @@
-"""One sample of everything, with no field left at its default: for the golden packets and the round trips."""
+"""One sample of every kind, with no field at its default, for the golden packets and the round trips."""
 
 from pathlib import Path
 from typing import Any
@@ -284,6 +284,6 @@ def packet(kind: int, body: Any) -> bytes:
 
 
 def log_entry(**changes: Any) -> bytes:
-    """A log entry that was never made as one, as somebody else's program sends it."""
+    """Return a log entry as sent by a program that does not use this library."""
     fields = {"source": "me", "name": "x", "at_ns": 1, "text": None, "number": None, "values": None, "shape": []}
     return packet(9, list((fields | changes).values()))

@@ -1,4 +1,4 @@
-"""A proxy played by the test: it answers as it is told, and notes what it is sent."""
+"""A proxy scripted by a test: it gives the configured answers, and records what it receives."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ from skyloop.transport.memory import Faults, MemoryServer
 WAIT_S = 10.0
 CAMERAS = (CameraInfo("front", 8, 6, 30.0), CameraInfo("bottom", 8, 6, 30.0))
 
-#: Fast thresholds, so that tests of lost links are short.
+#: Short time limits, so that tests of lost links are quick.
 QUICK = RedialPolicy(first_s=0.005, cap_s=0.05, hello_s=0.3, thresholds=Thresholds(late_s=0.1, silent_s=0.3))
 
 
 class ScriptedProxy:
-    """Serves one or more applications over the memory transport, with a beat of feedback each 10 ms."""
+    """Serves one or more applications over the memory transport, with feedback every 10 ms."""
 
     def __init__(self, *, faults: Faults | None = None, can_fly: bool = True) -> None:
         self.server = MemoryServer("scripted", faults=faults)
@@ -78,10 +78,10 @@ class ScriptedProxy:
         self.commands: list[Command] = []
         self.requests: list[AnyRequest] = []
         self.others: list[Sample] = []
-        self.answers: dict[type[AnyRequest], AnyReply | None] = {}  #: instead of the usual ones; None: no answer
+        self.answers: dict[type[AnyRequest], AnyReply | None] = {}  #: replace the usual answers; None for no answer
         self.parameters = {"limits.tilt": 0.35, "limits.speed": 2.0}
         self.state = FlightState.LANDED
-        self.owner: tuple[int, str, int] | None = None  #: app id, name, lease
+        self.owner: tuple[int, str, int] | None = None  #: application id, name, lease
         self.more: dict[str, Any] = {}  #: further fields of feedback
         self.beating = threading.Event()
         self.capabilities = Capabilities(
@@ -90,12 +90,12 @@ class ScriptedProxy:
             CAMERAS,
             why_not="" if can_fly else "it has no motors",
         )
-        self.run_id = random.getrandbits(40)  # sessions of another test's proxy are not taken for this one's
-        self.momentary: set[str] = set()  #: parameters whose writing does something once
-        self.forgets = True  #: whether who leaves loses the authority at once
+        self.run_id = random.getrandbits(40)  # so that sessions of other tests' proxies are not mistaken for this one's
+        self.momentary: set[str] = set()  #: parameters for which each write triggers an action
+        self.forgets = True  #: whether an application that leaves loses the authority at once
         self._peers: dict[int, tuple[Peer, str]] = {}
         self._lock = threading.Lock()
-        self.first_lease = 1  #: of the next run; higher: others have held the authority in it before
+        self.first_lease = 1  #: first lease of the next run; higher if others held the authority in it before
         self._leases = 0
         self._seq = 0
         self._event_seq = 0
@@ -115,14 +115,14 @@ class ScriptedProxy:
         return self
 
     def stop(self) -> None:
-        """Everything is gone, as after a SIGKILL."""
+        """End everything, as after a SIGKILL."""
         self._ended.set()
         self.beating.set()
         if self._thread is not None:
             self._thread.join()
         self.server.stop()
 
-    # What a test looks at --------------------------------------------------------------------------------------
+    # For tests: observing --------------------------------------------------------------------------------------
 
     def actions(self) -> list[AnyAction]:
         return [command.action for command in list(self.commands)]
@@ -131,18 +131,18 @@ class ScriptedProxy:
         assert self.notifier.wait_for(ready, WAIT_S), f"{what} did not happen"
 
     def until_commanded(self, action: AnyAction, after: int = 0) -> Command:
-        """The first such command after so many."""
+        """Wait for this action after the first ``after`` commands; return its command."""
         self.until(lambda: action in self.actions()[after:], f"{action!r}")
         return next(command for command in self.commands[after:] if command.action == action)
 
     def from_now_on(self, action: AnyAction, times: int = 4) -> list[Command]:
-        """Wait for so many such commands, and return all from the first on: those before it were sent before it."""
+        """Wait for this many commands with the action; return all from the first of them on."""
         after = len(self.commands)
-        self.until(lambda: self.actions()[after:].count(action) >= times, f"{action!r}, again and again")
+        self.until(lambda: self.actions()[after:].count(action) >= times, f"{action!r}, repeatedly")
         later = self.commands[after:]
         return later[[command.action for command in later].index(action) :]
 
-    # What a test makes happen ----------------------------------------------------------------------------------
+    # For tests: controlling --------------------------------------------------------------------------------------
 
     def publish(self, sample: Feedback | Event | Applied, topic: str) -> None:
         self.server.publish(topic, encode(sample))
@@ -153,7 +153,7 @@ class ScriptedProxy:
         self.publish(Event(kind, text, now_ns, Severity.INFO, self._event_seq, app, data), EVENTS)
 
     def feedback(self, **fields: Any) -> Feedback:
-        """Publish one sample; returns it."""
+        """Publish one sample and return it."""
         with self._lock:
             return self._feedback(fields)
 
@@ -184,7 +184,7 @@ class ScriptedProxy:
         return self._leases
 
     def take_over(self, by: str = "boss") -> None:
-        """Somebody else pre-empts the holder."""
+        """Let another application pre-empt the holder."""
         assert self.owner is not None
         app_id, name, lease = self.owner
         self.grant(99, by)
@@ -203,7 +203,7 @@ class ScriptedProxy:
         for peer, _ in list(self._peers.values()):
             self.server.send(peer, b"garbage")
 
-    # Transport's side ------------------------------------------------------------------------------------------
+    # Transport -------------------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
         self._peers[peer.id] = (peer, "")
@@ -283,7 +283,7 @@ class ScriptedProxy:
 
 @contextmanager
 def scripted(**options: Any) -> Iterator[ScriptedProxy]:
-    """A started proxy."""
+    """Provide a started proxy."""
     proxy = ScriptedProxy(**options).start()
     try:
         yield proxy
@@ -293,7 +293,7 @@ def scripted(**options: Any) -> Iterator[ScriptedProxy]:
 
 @contextmanager
 def flown(proxy: ScriptedProxy, *, app: str = "me", wait_s: float = 0.0, **options: Any) -> Iterator[Drone]:
-    """A drone connected to it; closed at the end, without landing."""
+    """Return a drone connected to it, which is closed at the end without landing."""
     options.setdefault("policy", QUICK)
     drone = open_drone(proxy.server.dial, app=app, **options, authority=Authority(wait_s=wait_s), timeout_s=WAIT_S)
     try:
@@ -303,7 +303,7 @@ def flown(proxy: ScriptedProxy, *, app: str = "me", wait_s: float = 0.0, **optio
 
 
 def background(*steps: Callable[[], object]) -> threading.Thread:
-    """Do this, one after the other, on another thread."""
+    """Provide a function that runs others in turn on another thread."""
 
     def run() -> None:
         for step in steps:
@@ -315,7 +315,7 @@ def background(*steps: Callable[[], object]) -> threading.Thread:
 
 
 class Sender:
-    """A worker played by the test: frames are numbered, and a tenth of a second apart."""
+    """A worker scripted by the test; its frames are numbered, and a tenth of a second apart."""
 
     def __init__(self, proxy: ScriptedProxy, processor: str = "detector", worker: int = 7) -> None:
         self.proxy = proxy

@@ -1,4 +1,4 @@
-"""A small world for the tests of following: upright things before the simulator's front camera, without pictures."""
+"""A small world for tests of following: upright objects before the simulator's front camera, without pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def state(at_s: float = 0.0, *, roll: float = 0.0, pitch: float = 0.0, yaw: floa
 def camera_at(
     x: float = 0.0, y: float = 0.0, z: float = 1.2, *, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
 ) -> Camera:
-    """The front camera of a vehicle."""
+    """Return the front camera of a vehicle."""
     attitude = state(roll=roll, pitch=pitch, yaw=yaw)
     camera = Camera.at(FRONT_CAMERA.info(), attitude, np.array([x, y, z]), FRONT_CAMERA.intrinsics(), SIZE)
     assert camera is not None
@@ -41,7 +41,7 @@ def camera_at(
 
 
 def box_of(camera: Camera, foot: Array, height_m: float = 1.72, width_m: float = 0.5) -> Box | None:
-    """The box of an upright thing, flat and turned to the camera, cut off at the image's edge; None: out of view."""
+    """Return the box of a flat, upright object that faces the camera, cut at the image's edge; None if out of view."""
     away = foot[:2] - camera.position[:2]
     aside = np.array([-away[1], away[0], 0.0]) / max(1e-9, float(np.hypot(*away))) * width_m / 2
     up = np.array([0.0, 0.0, height_m])
@@ -58,7 +58,7 @@ def box_of(camera: Camera, foot: Array, height_m: float = 1.72, width_m: float =
 
 
 def view_of(camera: Camera, foot: Array, height_m: float = 1.72, rng: np.random.Generator | None = None) -> BoxView:
-    """What the box of a thing that is in view shows, with the noise of a detector."""
+    """Return what the box of a visible object shows, with a detector's noise."""
     box = box_of(camera, foot, height_m)
     assert box is not None, "the test's thing is out of view"
     view = BoxView.of(box if rng is None else noisy(box, rng), camera)
@@ -77,23 +77,23 @@ Path = Callable[[float], tuple[float, float]]
 
 
 def walk(x: float, y: float, forward: float = 0.0, left: float = 0.0) -> Path:
-    """A straight way at a constant velocity, from the start on."""
+    """Return a straight path at constant velocity from the start."""
     return lambda t: (x + forward * t, y + left * t)
 
 
 class ChaseWorld:
-    """A vehicle that answers a velocity after 0.4 s, or an attitude after 0.15 s, and a target it sees by its boxes.
+    """A vehicle that follows a velocity after 0.4 s or an attitude after 0.15 s, and a target that it sees as boxes.
 
     Attributes:
-        phases: Of each step.
-        ranges: True horizontal distances, of each step [m].
-        bearings: The vehicle as seen from the target, of each step [rad].
-        commands: What the law returned.
-        speeds: Towards the target, of each step [m/s].
-        azimuths: Of the target, from straight ahead [rad].
-        places: Of the vehicle, (3,) each.
+        phases: The phase in each step.
+        ranges: True horizontal distance in each step [m].
+        bearings: Bearing of the vehicle from the target in each step [rad].
+        commands: The set-points that the law returned.
+        speeds: Speed towards the target in each step [m/s].
+        azimuths: Azimuth of the target from straight ahead [rad].
+        places: Position of the vehicle, (3,) each.
 
-    With ``drift_m_s`` the velocity that it reports is off by so much, to the east, and its position is known.
+    With ``drift_m_s``, its reported velocity is off by this much to the east, and its position is known.
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class ChaseWorld:
         self._seen_ns: int | None = None
         self._rate, self._steps = 0.0, 0
         self._tilts = TiltVelocity()
-        self._reckoned, self._airspeed = np.zeros(3), np.zeros(3)  # of a vehicle that reports no velocity
+        self._reckoned, self._airspeed = np.zeros(3), np.zeros(3)  # if the vehicle reports no velocity
 
     @property
     def time_s(self) -> float:
@@ -176,7 +176,7 @@ class ChaseWorld:
         self._steps += 1
 
     def _reckon(self) -> None:
-        """What the vehicle's attitude tells of its motion."""
+        """Return the motion estimated from the vehicle's attitude."""
         roll, pitch = self.tilt.tolist()
         ns = nanoseconds(START_S + self.time_s)
         tilted = Feedback(captured_ns=ns, state=FlightState.FLYING, roll_rad=roll, pitch_rad=pitch, yaw_rad=self.yaw)

@@ -250,7 +250,7 @@ def test_a_socket_dropped_during_the_turn_is_left_alone(served: Served, reactor:
 
 
 def test_a_server_stops_after_its_reactor_has_ended() -> None:
-    """It waited for ever for its connections, or raised because the reactor's epoll was closed."""
+    """It waited forever for its connections, or raised because the reactor's epoll was closed."""
     reactor = Reactor()
     served = Served(reactor)
     reactor.close()

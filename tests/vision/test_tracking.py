@@ -83,7 +83,7 @@ def test_median_flow_stays_lost_until_restarted() -> None:
 
 
 def twins(count: int, *, hidden: range, target_after: bool) -> Sequence:
-    """A target and its exact twin; a plain wall hides the target, and perhaps only the twin comes back."""
+    """Return a target and its exact twin; a plain wall hides the target, and perhaps only the twin returns."""
     rng = np.random.default_rng(8)
     background, what = texture(rng, 320, 240), texture(rng, 40, 40, (60, 120, 180))
 

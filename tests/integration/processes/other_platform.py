@@ -1,7 +1,7 @@
 """Runs the ``skyloop`` command as on another platform: ``python -m`` this module ``win32 list``.
 
-What Skyloop imports from others is imported first, then ``sys.platform`` is changed and the parts of Python are
-withheld that the other platform lacks. It shows what Skyloop itself needs, and nothing of the others' libraries there.
+First imports the third-party modules that Skyloop uses, then changes ``sys.platform`` and hides the parts of Python
+that the other platform lacks. This tests what Skyloop itself needs, not how other libraries behave there.
 """
 
 import asyncio

@@ -1,7 +1,7 @@
 """djitellopy 2.5.0, an independent Python program, flies the emulated Tello.
 
-It binds the drone's own port 8889 on its side, and 8890 and 11111, on all addresses: so each end has a network of its
-own. It waits 7 s for an answer, takes whatever comes for it, and asks again.
+It binds the drone's own port 8889 on its side, and 8890 and 11111, on all addresses, so each end has a separate
+network. It waits 7 s for an answer, accepts any datagram as one, and repeats its command.
 """
 
 from __future__ import annotations

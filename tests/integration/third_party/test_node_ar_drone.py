@@ -1,8 +1,7 @@
 """ar-drone 0.3.3 from npm, an independent program, flies the emulated AR.Drone 2.
 
 Its quirks: its first line is CTRL with the sequence number 0, its REF lacks the five bits that should always be set (it
-is 512 for take-off), and it drops, and says nothing, each navdata datagram of the full mode whose option 27 has not 216
-bytes.
+is 512 for take-off), and it silently drops each datagram of full navdata whose option 27 does not have 216 bytes.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """pyardrone 0.6.1, an independent Python program, flies the emulated AR.Drone 2.
 
-Its quirks: it takes navdata only from the very address and port that it asked, repeats REF only as often as its user
-does, lets its navdata thread die of an option 27 of any size but 12 bytes (so it flies in the demo mode, which has
-none), and strips 64 bytes of a PaVE header whatever the header says.
+Its quirks: it accepts navdata only from the address and port of its request, repeats REF only as often as its user
+does, ends its navdata thread on an option 27 of any size but 12 bytes (so it flies in demo mode, which has none), and
+strips 64 bytes of a PaVE header whatever size the header states.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def test_revoked_expired_and_foreign_identities_are_refused(
 @pytest.mark.parametrize(
     "garbage", [b"", b"\xc0", b"\x93\xc4\x00\xc4\x00\xc4\x00", bytes(100), msgspec.msgpack.encode([b"x" * 500] * 3)]
 )
-def test_garbage_is_no_proof(rings: dict[str, KeyRing], garbage: bytes) -> None:
+def test_garbage_is_not_a_proof(rings: dict[str, KeyRing], garbage: bytes) -> None:
     with pytest.raises(LinkError):
         Agreement(rings["alpha"], *TERMS).answer(garbage, NOW)
 

@@ -113,7 +113,7 @@ def test_a_key_that_is_not_valid_now_is_refused(jane: Path, at: datetime, words:
         load(jane, now=at)
 
 
-def test_the_lab_itself_is_no_identity(lab: Lab) -> None:
+def test_the_lab_itself_is_not_an_identity(lab: Lab) -> None:
     with pytest.raises(UsageError, match=re.escape(str(lab.directory / "issued" / "NAME"))):
         load(lab.directory, now=NOW)
 

@@ -64,7 +64,7 @@ def test_the_authority_vouches_for_no_other_site(tmp_path: Path) -> None:
         handshake(made, "bank.example")
 
 
-def test_it_is_kept_while_it_fits(tmp_path: Path) -> None:
+def test_a_certificate_is_kept_while_it_fits(tmp_path: Path) -> None:
     folder = tmp_path / "keys" / "pages"
     first = page_certificate(folder, OWN, (), NOW)
     content, authority = first.certificate.read_bytes(), first.authority.read_bytes()
@@ -84,7 +84,7 @@ def test_it_is_kept_while_it_fits(tmp_path: Path) -> None:
     assert set(handshake_names) == set(OWN)
 
 
-def test_names_that_it_may_not_certify_are_refused(tmp_path: Path) -> None:
+def test_names_that_the_authority_may_not_certify_are_refused(tmp_path: Path) -> None:
     folder = tmp_path / "keys" / "pages"
     with pytest.raises(UsageError, match=r"none of 8\.8\.8\.8 is private"):
         page_certificate(folder, ["8.8.8.8"], (), NOW)

@@ -42,7 +42,7 @@ def test_a_new_name_on_the_roster_is_announced_once(ring: KeyRing, lab: Lab) -> 
     assert ring.shut_out == frozenset()
 
 
-def test_a_renewed_key_is_no_news(ring: KeyRing, lab: Lab) -> None:
+def test_a_renewed_key_is_not_announced(ring: KeyRing, lab: Lab) -> None:
     lab.issue(make_identity("jane", "pilot", "alpha*"), now=NOW + DAY)
     assert ring.poll(NOW) == []
     assert ring.credentials.roster.number == 5

@@ -1,7 +1,7 @@
 """An emulated ArduCopter that journals what it does: ``python -m tests.promises.chaos.autopilot NAME FOLDER PROXY``.
 
-It outlives its proxy. ``PROXY`` is the proxy's UDP port, or a path at which a serial port is made for it. Lines on
-standard input order what befalls the vehicle and its link (:meth:`JournalledAutopilot.order`).
+It outlives its proxy. ``PROXY`` is the proxy's UDP port, or a path at which a serial port is created for it. Lines on
+standard input cause faults of the vehicle and its link (:meth:`JournalledAutopilot.order`).
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ def silent_flood(lane: Lane, source: random.Random, ending: threading.Event) -> 
 
 
 def garbage_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
-    """Connections that send data which is no packet."""
+    """Open connections that send data which is not a packet."""
     with _running(lane.run("trouble", "garbage", str(lane.socket))):
         ending.wait(source.uniform(2.0, 5.0))
 

@@ -1,7 +1,7 @@
 """A pilot that calls 32 times a second, forever: ``python -m tests.promises.chaos.pilot NAME FOLDER``; see ``--help``.
 
-It journals each take-off that it asks for, and the beginning and the end of each other call, with its number. On
-SIGUSR1 it forks, and the child ends by ``sys.exit``.
+It journals each take-off that it requests, and the start and end of each other call, with its number. On SIGUSR1 it
+forks, and the child ends by ``sys.exit``.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class Radio:
         looked_s, full = time.monotonic(), False
         while True:
             now_s = time.monotonic()
-            if self._far is None and now_s - looked_s > STALLED_S:  # for datagrams the kernel's time stamps tell
+            if self._far is None and now_s - looked_s > STALLED_S:  # for datagrams, the kernel's time stamps are used
                 self._note("stalled", round((now_s - looked_s) * 1000))
             looked_s = now_s
             if now_s < self.full_until_s and not full:  # data already here has been received: no port can recall it

@@ -50,7 +50,7 @@ def silent(path: str) -> None:
 
 
 def garbage(path: str) -> None:
-    """Send data that is no packet, on one connection after another."""
+    """Send data that is not a packet, on one connection after another."""
     source = random.Random(1)
     _ready()
     while True:

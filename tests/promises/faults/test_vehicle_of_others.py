@@ -1,6 +1,7 @@
 """A vehicle that others fly, land or take over in flight: an emulated autopilot commanded by two programs.
 
-The other ground station says its commands on another link. What the proxy said is counted where the autopilot hears it.
+The other ground station sends its commands on another link. The proxy's commands are counted where the autopilot
+receives them.
 """
 
 from __future__ import annotations
@@ -181,7 +182,7 @@ def test_a_safety_pilot_keeps_the_vehicle_whatever_the_program_does(
     kind: Kind, end: Callable[[Drone], None], note: Path
 ) -> None:
     """A bug in a callback, a released key, the end of ``skyloop fly``, of a swarm or of a block: the library never
-    takes the vehicle from whoever selected a mode unless the program orders it.
+    takes the vehicle from whoever selected a mode unless the program requests it.
     """
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
@@ -232,7 +233,7 @@ def test_a_safety_pilot_keeps_the_vehicle_on_a_route(kind: Kind, note: Path) -> 
 
 
 @KINDS
-def test_a_new_order_takes_it_back(kind: Kind, note: Path) -> None:
+def test_a_new_command_takes_the_vehicle_back(kind: Kind, note: Path) -> None:
     with Scene(kind, note) as scene:
         proxy = scene.proxy()
         with taken_off(scene) as drone:
@@ -297,7 +298,7 @@ def ready(scene: Scene) -> Drone:
 
 
 def stays_down(scene: Scene, proxy: Proxy) -> None:
-    """Check that it stays disarmed on the ground for some seconds of its own time."""
+    """Check that it stays disarmed on the ground for some simulated seconds."""
     wait_until(lambda: not scene.armed, "it stands")
     scene.watched(proxy, 150)
     assert not scene.armed

@@ -39,7 +39,7 @@ def echo(protocol: str, address: str) -> None:
 
 
 def send(protocol: str, address: str, count: int, period_s: float) -> None:
-    """Send probes at a period; returns those that came back."""
+    """Send probes at a period; return those that came back."""
     sock = socket.socket(socket.AF_INET, KINDS[protocol])
     sock.connect((address, PORT))
     if protocol == "tcp":

@@ -77,7 +77,7 @@ def serve(pipe: Pipe) -> None:
             module, name, arguments, keywords = call
             try:
                 answer = (True, getattr(import_module(module), name)(here, *arguments, **keywords))
-            except Exception:  # noqa: BLE001  (whatever it is, the test wants to know)
+            except Exception:  # noqa: BLE001  (reported to the test)
                 answer = (False, traceback.format_exc())
             pipe.send(answer)
     finally:

@@ -26,7 +26,7 @@ Start = Callable[..., Process]
 
 
 def rounds(host: Host, protocol: str, address: str, count: int) -> list[tuple[int, int]]:
-    """The probes that came back: their numbers and round-trip times [ns]."""
+    """Return the numbers and round-trip times [ns] of the probes that came back."""
     said = host.run(sys.executable, PROBES, "send", protocol, address, str(count), str(PERIOD_S))
     return [(number, heard - sent) for number, sent, heard in json.loads(said)]
 

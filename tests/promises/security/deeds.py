@@ -47,7 +47,7 @@ _NUMBERS = count(10**6)
 
 
 class Deed(NamedTuple):
-    """An attempt. ``done`` says whether it has had any effect so far."""
+    """An attempt. ``done`` returns whether it has had any effect so far."""
 
     what: str
     do: Callable[[Rig, Intruder], None]
@@ -317,7 +317,7 @@ COLUMNS = {
 SEEN = {"nobody", "kim", "bob", "olga"}
 WORKS = {
     "find the drone": {*SEEN, "oscar", "bravo", "hub"},
-    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy forwards nothing of others
+    "answer discovery in the proxy's place": {"nobody"},  # with keys, a proxy forwards nothing from others
     "see its feedback": SEEN,
     "see its video": SEEN,
     "read its parameters": SEEN,

@@ -211,7 +211,7 @@ class Intruder:
         return packet, attachment
 
     def send(self, way: str, sample: Sample, *, who: str | None = None, connection: str | None = None) -> None:
-        """Send as an application, with one of its own keys or another user's."""
+        """Send as an application, with its own key or another user's."""
         key = layout.upward(way, DRONE, who or self.who, connection or self.id)
         self.put(key, encode(sample))
 
@@ -238,7 +238,7 @@ class Intruder:
         return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
 
     def join(self, who: str | None = None) -> bool:
-        """Open a connection, with its token, as the layout of keys says; returns whether the proxy agreed."""
+        """Open a connection, with its token, as the key layout requires; return whether the proxy agreed."""
         who = who or self.who
         self.listen(layout.to(DRONE, self.id))
         self.held.append(self.session.liveliness().declare_token(layout.app(DRONE, who, self.id)))

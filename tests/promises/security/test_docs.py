@@ -23,7 +23,7 @@ DOORS = {
         "another_drones_proxy_that_listens_as_this_one_is_not_found"
     ),
     "a command, an emergency stop, a request for the authority or a parameter on the Zenoh key of observers": (
-        "an_order_by_the_key_for_questions_is_refused_and_reported"
+        "a_command_sent_by_the_key_for_queries_is_refused_and_reported"
     ),
     "a command for a lease in force, by another pilot's own connection": (
         "recorded_bytes_by_another_pilots_own_connection_are_refused_and_reported"

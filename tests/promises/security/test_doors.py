@@ -181,10 +181,10 @@ REQUESTS: dict[str, Callable[[Rig], AnyRequest]] = {
 
 @pytest.mark.parametrize("what", [*ORDERS, *REQUESTS])
 @pytest.mark.parametrize("who", ["olga", "bob", "kim"])
-def test_an_order_by_the_key_for_questions_is_refused_and_reported(
+def test_a_command_sent_by_the_key_for_queries_is_refused_and_reported(
     rig: Rig, joined: Callable[[str], Intruder], who: str, what: str
 ) -> None:
-    """The one key by which an observer reaches the proxy carries no orders, whoever uses it."""
+    """The one key by which an observer reaches the proxy carries no commands, whoever uses it."""
     intruder = joined(who)
     before = len(rig.bench.published(EventKind.COMMAND_REFUSED))
     told, holder = list(rig.bench.driver.told), rig.bench.proxy.handler.authority.holder
@@ -331,7 +331,7 @@ def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None
                 def asked(word: bytes) -> bool:
                     for key in (false, *keys):  # noqa: B023  called at once
                         session.put(key, word)
-                    return (keys[-1], word) in heard  # noqa: B023  put last, so the others would have come before
+                    return (keys[-1], word) in heard  # noqa: B023  put last, so that the others would have arrived before
 
                 wait_until(lambda: asked(b"first"), "a question arrives")
                 # By now it knows the subscribers: before, a command may have been lost, but not a question.

@@ -56,7 +56,7 @@ def test_a_world_file(name: str, tmp_path: Path) -> None:
     refused(load_world, tmp_path / "x.toml", WORLDS[name])
 
 
-def test_text_with_dots_is_no_deep_key(tmp_path: Path) -> None:
+def test_text_with_dots_is_not_a_nested_key(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
     path.write_bytes(ROOM + b"# 1.2.3.4.5.6.7.8.9.10.11.12.13.14 and so on\n")
     assert load_world(path).room.size_m == (8.0, 6.0, 3.0)

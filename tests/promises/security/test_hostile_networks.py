@@ -110,13 +110,13 @@ def test_weights_of_a_tracker_are_also_tried_alone(
         LearnedTracker(make(tmp_path / "weights.onnx"))
 
 
-def test_a_file_that_is_no_network_is_reported_as_before(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_network_is_reported_as_before(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(FileFormatError, match=r"text\.onnx can't be loaded as an ONNX file: "):
         OnnxDetector(tmp_path / "text.onnx")
 
 
-def test_networks_of_people_are_loaded_as_before(tmp_path: Path) -> None:
+def test_valid_networks_are_loaded_as_before(tmp_path: Path) -> None:
     assert PolicyNetwork(write_policy(tmp_path / "policy.onnx")).camera == "front"
     copied = tmp_path / "figures.onnx"
     copied.write_bytes(Path(SIMULATED_WEIGHTS).read_bytes())

@@ -145,7 +145,7 @@ def test_a_small_file_takes_little_memory_and_time_whatever_it_unpacks_to(tmp_pa
         assert float(seconds) < 2.0, path.name
 
 
-def test_what_recorders_write_is_within_the_limits(tmp_path: Path) -> None:
+def test_recorders_stay_within_the_limits(tmp_path: Path) -> None:
     """Pictures and telemetry that never change: no real data compresses better."""
     still = cv2.imencode(".png", np.zeros((720, 1280, 3), np.uint8))[1].tobytes()
     for kind in (CompressionType.ZSTD, CompressionType.LZ4):
@@ -420,7 +420,7 @@ def test_a_file_name_that_is_not_text_hides_no_other(
     assert recordings._path("caf\\xe9.mcap").read_bytes() == flight.read_bytes()
 
 
-def test_the_terminals_list_shows_all(
+def test_the_terminals_list_shows_all_recordings(
     tmp_path: Path, flight: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def log(*words: str | Path) -> Ended:

@@ -88,14 +88,14 @@ def put(value: Any, path: tuple[int | str, ...], hostile: Any) -> Any:
 
 
 class Ears:
-    """Stands in for a drone, and gives the listeners of a feed."""
+    """A stand-in for a drone that provides the callbacks of a feed."""
 
     def on_command(self, function: Any, *, inline: bool) -> Any: ...
     def on_log(self, function: Any, *, inline: bool) -> Any: ...
 
 
 def consume(sample: Sample) -> None:
-    """Everything done with a sample without a way to check whether it makes sense."""
+    """Do everything that is done with a sample without a check of its meaning."""
     if isinstance(sample, Feedback):
         feedback_values(sample, 0)
         motion_values(sample)
@@ -263,7 +263,7 @@ def test_any_text_is_a_request_for_video_or_refused(text: str) -> None:
 
 
 def test_parameters_of_a_driver_travel_whatever_their_bounds_are() -> None:
-    """They do not come from a peer: NaN and infinity in them are shown as they are."""
+    """They do not come from a peer, so NaN and infinity in them are shown unchanged."""
     reply = decode((Path(__file__).parents[2] / "data/packets/golden/reply-value.bin").read_bytes())
     assert isinstance(reply, Reply)
     parameter = Parameter("x", reply.body.parameter.type, math.inf, minimum=-math.inf)  # type: ignore[union-attr]

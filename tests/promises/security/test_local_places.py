@@ -80,7 +80,7 @@ def test_silent_connections_keep_no_one_out(
     wait_until(lambda: len(place.log.joined) == known + 1, "the pilot is in")
     assert place.server.admit(place.log.joined[-1], pilot=True) == ""
     assert "its place at local:alpha went to a newer connection" in word(silent[0])
-    for _ in range(8):  # introduced clients stay, whatever else happens
+    for _ in range(8):  # clients that have sent their Hello stay
         place.raw(*first)
     wait_until(lambda: len(place.server._connections) <= 4, "the others gave way to one another")
     assert client.send(b"still here")
@@ -161,7 +161,7 @@ def test_an_observer_without_a_free_place_is_refused() -> None:
 
 
 def test_another_users_lock_delays_no_one(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A member of a group can open the directory for reading, and lock it as long as it likes."""
+    """A member of a group can open the directory for reading, and lock it for any time."""
     group = grp.getgrgid(os.getegid()).gr_name
     monkeypatch.setenv("SKYLOOP_GROUP", group)
     bravo = LocalServer("bravo", group=group)

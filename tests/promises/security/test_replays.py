@@ -1,6 +1,6 @@
 """Recorded bytes of the command channel, sent again: refused on every transport, with an event that says why.
 
-The one command that is taken whatever its number, age and lease, the emergency stop of a pilot, is here too.
+A pilot's emergency stop, the only command accepted whatever its number, age and lease, is tested here too.
 """
 
 from __future__ import annotations

@@ -167,7 +167,7 @@ def test_no_new_connection_is_made_to_a_user_revoked_meanwhile(tmp_path: Path) -
 
 
 def test_an_application_moves_on_to_the_proxy_that_has_the_key(routed: Rig) -> None:
-    """An impostor says first that it is the proxy, and answers queries."""
+    """An impostor is the first to claim to be the proxy, and answers queries."""
     false = "0" * 16
     hub = routed.intruder("hub")
     key = layout.info(DRONE)
@@ -201,7 +201,7 @@ def test_a_connection_ends_with_its_key_though_a_router_lies_between(rig: Rig, m
 
 
 def test_a_restarted_router_excludes_revoked_users(lab: Lab, kept: Callable[[str], Path]) -> None:
-    """Others pass; the revoked pilot, who was linked, is denied everything."""
+    """Other users are admitted; the revoked pilot, who was connected, is denied everything."""
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     keys = load(keys_of(lab, "hub", lab.directory / "router"))
     hub = acquire(secured(FabricSettings(listen=(place,), multicast=False), keys), Part.ROUTER)

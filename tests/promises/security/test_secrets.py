@@ -138,7 +138,7 @@ def test_the_error_about_a_camera_does_not_repeat_its_secrets() -> None:
 
 
 class Careless(Driver):
-    """Repeats whatever its library says, including the address."""
+    """A driver that repeats its library's messages, including the address."""
 
     def __init__(self, *, opens: bool = True) -> None:
         super().__init__(parse_uri(f"video://{CAMERA}?camera=front"))

@@ -30,7 +30,7 @@ class Viewer:
         self.parameters: dict[str, Any] = {}
         self.answers: dict[str, list[dict[str, Any]]] = {}
         self._subscribed: dict[int, str] = {}
-        self._numbers = itertools.count(1)  # of subscriptions: tells late messages of an old one apart
+        self._numbers = itertools.count(1)  # number of the subscription, to recognise late messages of an old one
         self._stack = ExitStack()
         dialled = connect(
             url, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_queue=1, max_size=None, close_timeout=0.1

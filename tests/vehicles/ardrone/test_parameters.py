@@ -12,7 +12,7 @@ from skyloop.drivers.recording_sink import mismatch
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.proxy.parameters import check
-from skyloop.vehicles.ardrone.parameters import Commands, active_camera, entries_of, taken, written
+from skyloop.vehicles.ardrone.parameters import Commands, active_camera, entries_of, is_confirmed, prepare_write
 from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
 from skyloop.vehicles.ardrone.wire.at import AtMessage
 from skyloop.vehicles.ardrone.wire.configuration import FLIGHT_ANIMATIONS, LED_ANIMATIONS, format_value, keys_of
@@ -38,8 +38,8 @@ def test_every_parameter_fits_its_own_description(version: int) -> None:
 def test_every_parameter_survives_a_round_trip(version: int) -> None:
     for name, entry in entries_of(DRONES[version], version).items():
         if not entry.parameter.read_only:
-            same, text = written(entries_of(DRONES[version], version), name, entry.parameter.value)
-            assert taken(same, text, DRONES[version][entry.key]), name
+            same, text = prepare_write(entries_of(DRONES[version], version), name, entry.parameter.value)
+            assert is_confirmed(same, text, DRONES[version][entry.key]), name
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_every_parameter_survives_a_round_trip(version: int) -> None:
     ],
 )
 def test_names_and_units(name: str, value: Value, key: str, text: str) -> None:
-    entry, said = written(entries_of(DRONES[2], 2), name, value)
+    entry, said = prepare_write(entries_of(DRONES[2], 2), name, value)
     assert (entry.key, said) == (key, text)
     assert entry.from_text(text) == (pytest.approx(value) if isinstance(value, float) else value)
     assert not entry.parameter.read_only
@@ -67,11 +67,11 @@ def test_names_and_units(name: str, value: Value, key: str, text: str) -> None:
 
 @given(st.floats(0.2, 2.0))
 def test_a_limit_in_si_counts_as_written(value: float) -> None:
-    entry, text = written(entries_of(DRONES[2], 2), "limits.climb", value)
+    entry, text = prepare_write(entries_of(DRONES[2], 2), "limits.climb", value)
     told = entry.from_text(text)
     assert isinstance(told, float)
     assert math.isclose(told, value, rel_tol=1e-5)
-    assert taken(entry, text, f"{value * 1000:.3f}")
+    assert is_confirmed(entry, text, f"{value * 1000:.3f}")
 
 
 @pytest.mark.parametrize(
@@ -86,13 +86,13 @@ def test_a_limit_in_si_counts_as_written(value: float) -> None:
 )
 def test_read_only_parameters(name: str) -> None:
     with pytest.raises(ParameterError, match="only be read") as caught:
-        written(entries_of(DRONES[2], 2), name, "x")
+        prepare_write(entries_of(DRONES[2], 2), name, "x")
     assert caught.value.code == Refusal.READ_ONLY
 
 
 def test_an_unknown_name() -> None:
     with pytest.raises(UnknownNameError, match=r"limits\.tilt"):
-        written(entries_of(DRONES[2], 2), "limits.tild", 0.1)
+        prepare_write(entries_of(DRONES[2], 2), "limits.tild", 0.1)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_an_unknown_name() -> None:
 )
 def test_values_of_the_wrong_type(name: str, value: Value) -> None:
     with pytest.raises(ParameterError) as caught:
-        written(entries_of(DRONES[2], 2), name, value)
+        prepare_write(entries_of(DRONES[2], 2), name, value)
     assert caught.value.code == Refusal.WRONG_TYPE
 
 
@@ -156,7 +156,7 @@ def test_texts_without_a_value() -> None:
     entry = entries_of(DRONES[2], 2)["camera.active"]
     with pytest.raises(DecodeError, match="not the index of one of"):
         entry.from_text("7")
-    assert not taken(entry, "1", "bottom")
+    assert not is_confirmed(entry, "1", "bottom")
 
 
 # Commands --------------------------------------------------------------------------------------------------------

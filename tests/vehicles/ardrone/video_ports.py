@@ -64,7 +64,7 @@ def digest(data: bytes) -> Digest:
 
 
 class Viewer:
-    """Displays pictures, unless told otherwise, and records what it sees."""
+    """Displays pictures unless configured otherwise, and records them."""
 
     def __init__(self) -> None:
         self.looks = True

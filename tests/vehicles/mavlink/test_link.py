@@ -96,7 +96,7 @@ def test_a_shared_thread_serves_it_too() -> None:
 
 
 def test_an_unresolvable_name_delays_no_other_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shared thread comes back for the answer once there is one."""
+    """The shared thread returns for the answer once there is one."""
     released, found = threading.Event(), socket.getaddrinfo("127.0.0.1", None, type=socket.SOCK_STREAM)
 
     def resolver(*_: object) -> object:

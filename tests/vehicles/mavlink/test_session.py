@@ -132,7 +132,7 @@ def test_after_a_loss_no_other_system_is_flown() -> None:
 
 
 @pytest.mark.parametrize(("system", "component", "kind", "autopilot"), [(255, 190, 6, 8), (1, 100, 30, 8)])
-def test_ground_stations_and_cameras_are_no_vehicles(system: int, component: int, kind: int, autopilot: int) -> None:
+def test_ground_stations_and_cameras_are_not_vehicles(system: int, component: int, kind: int, autopilot: int) -> None:
     bench = Bench(Vehicle(PX4))
     bench.hear(m.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3), codec=Codec(system, component))
     assert not bench.session.is_receiving
@@ -223,7 +223,7 @@ def test_its_clock_is_mapped_to_ours_by_timesync() -> None:
     bench.hear(m.MAVLink_timesync_message(theirs_ns, question.ts1))
     assert bench.session.clock.round_trip_s is not None
     boot_ms = bench.vehicle.boot_ms
-    bench.clock.advance(0.1)  # the message arrives 100 ms late and says when it was sent
+    bench.clock.advance(0.1)  # the message arrives 100 ms late, with its sending time
     bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
     assert bench.clock() - bench.newest.captured_ns == pytest.approx(100e6, abs=5e6)
 
@@ -690,7 +690,7 @@ def test_a_vehicle_without_an_identity_is_read_again(serial: int) -> None:
     assert bench.link() is LinkState.UP
 
 
-def test_a_late_message_is_no_reboot() -> None:
+def test_a_late_message_is_not_a_reboot() -> None:
     """One attitude is 1.5 s late: no loss, no missing set-point, and it does not count as the newest."""
     bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
     bench.apply(Velocity(forward=0.5))
@@ -710,7 +710,7 @@ def test_a_late_message_is_no_reboot() -> None:
     assert all(each.vx == pytest.approx(0.5) for each in sent)
 
 
-def test_a_serial_number_missing_in_one_protocol_version_is_no_other_vehicle() -> None:
+def test_a_serial_number_missing_in_one_protocol_version_is_not_another_vehicle() -> None:
     """MAVLink 1 truncates the longer one: then the shorter one decides, or none."""
     none = [0] * 8
 

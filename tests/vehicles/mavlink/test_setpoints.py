@@ -218,7 +218,7 @@ def about_to_rise(autopilot: int) -> Bench:
 
 @AUTOPILOTS
 def test_a_pilot_who_takes_the_vehicle_before_it_is_armed_keeps_it(autopilot: int) -> None:
-    """Its mode was asked for again, and it was armed and took off."""
+    """The mode was requested again, and the vehicle was armed and took off."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -241,7 +241,7 @@ def test_a_pilot_who_takes_the_vehicle_before_it_is_armed_keeps_it(autopilot: in
 
 @AUTOPILOTS
 def test_a_pilot_who_takes_the_vehicle_before_its_heartbeat_shows_the_arming_keeps_it(autopilot: int) -> None:
-    """A PX4 tells it once a second: sticks moved in that second were answered by a take-off."""
+    """A PX4 reports it once a second: sticks moved in that second were answered by a take-off."""
     bench = Bench(Vehicle(autopilot)).found()
     vehicle = bench.vehicle
     vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
@@ -579,7 +579,7 @@ def test_an_operator_who_holds_a_landing_vehicle_keeps_it(autopilot: int, alone:
 
 @AUTOPILOTS
 def test_our_landing_is_requested_again_if_the_vehicle_is_found_holding(autopilot: int) -> None:
-    """Its own actions during a silence are no pilot's decision."""
+    """Its own actions during a silence are not a pilot's decision."""
     bench = steering(autopilot)
     bench.apply(Land())
     bench.vehicle.mode = LAND[autopilot][0]
@@ -592,7 +592,7 @@ def test_our_landing_is_requested_again_if_the_vehicle_is_found_holding(autopilo
 
 
 @AUTOPILOTS
-def test_a_late_mode_of_our_own_is_no_other_operators(autopilot: int) -> None:
+def test_a_late_mode_of_our_own_is_not_another_operators(autopilot: int) -> None:
     """A pilot is back while the failsafe's mode is still on its way: the guided mode is requested again."""
     bench = steering(autopilot)
     bench.apply(Hover(), alone=True)
@@ -941,7 +941,7 @@ def test_a_stop_right_after_arming_is_sent_at_once_and_survives_a_quick_reset(au
     bench.commands()
     bench.apply(EmergencyStop())
     assert bench.commands() == [CUT], "before any heartbeat shows it as armed"
-    for _ in range(2):  # a delayed one says that it is not armed
+    for _ in range(2):  # a delayed one reports that it is not armed
         bench.clock.advance(0.1)
         bench.hear(stale_heartbeat(bench))
         bench.tick()

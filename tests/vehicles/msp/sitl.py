@@ -29,7 +29,7 @@ _SETTINGS: Final = (
 
 
 class Sitl:
-    """Starts it in a folder, configures it as ``docs/msp.md`` says, and feeds it a level world at rest."""
+    """Runs it in a folder, configured as in ``docs/msp.md``, and feeds it a level world at rest."""
 
     def __init__(self, folder: Path) -> None:
         self.roll_rad = 0.0

@@ -61,7 +61,7 @@ def vehicle(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Vehicle]
 
 
 class Line:
-    """A separate client, silent when the test wants it."""
+    """A separate client, silent on request."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         self._socket = socket.create_connection((vehicle.host, vehicle.port), 5)

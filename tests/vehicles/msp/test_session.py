@@ -647,7 +647,7 @@ def test_no_stop_arms_a_vehicle_with_unknown_state_and_mode_names(silent: Functi
 
 
 def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -> None:
-    """The centre of roll may be half throttle; a stop without an arm switch was sent like that."""
+    """The centre of roll may be half throttle; a stop without an arm switch was sent as such."""
     setpoints = SetpointController()
     setpoints.on_report(Report(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)

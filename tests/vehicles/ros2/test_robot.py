@@ -133,7 +133,7 @@ def test_stamps_of_the_systems_clock_and_of_another() -> None:
 
 
 class FakeRobot:
-    """Records sent velocities; services answer when the test wants."""
+    """Records sent velocities; services answer on the test's request."""
 
     def __init__(self) -> None:
         self.sent: list[Velocity] = []

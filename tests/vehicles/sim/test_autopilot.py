@@ -234,7 +234,7 @@ def test_the_firmwares_feedback_includes_the_truth_once_known() -> None:
 
 
 def test_link_reasons_name_the_firmware_inside() -> None:
-    """Its driver once told people to start the firmware, which this drone starts, at a port they had never seen."""
+    """Its driver once asked users to start the firmware, which this drone starts, at a port unknown to them."""
     flight = FirmwareFlight(options_of(parse_uri("sim://?autopilot=betaflight")), "")
     sink = RecordingSink()
     inner = _InnerSink(flight, sink)

@@ -377,7 +377,7 @@ def test_a_stream_without_a_key_frame_shows_nothing_and_reports_that(tmp_path: P
 # Devices ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_missing_device_is_no_error() -> None:
+def test_a_missing_device_is_not_an_error() -> None:
     sink = RecordingSink()
     with playing("video:///dev/skyloop-no-such-camera?width=320&height=240&fps=15", sink) as driver:
         camera = driver.capabilities().cameras[0]
@@ -389,7 +389,7 @@ def test_a_missing_device_is_no_error() -> None:
     assert not sink.events
 
 
-def test_a_file_that_is_no_camera_is_reported() -> None:
+def test_a_file_that_is_not_a_camera_is_reported() -> None:
     sink = RecordingSink()
     with playing("video:///dev/null?exposure=10&gain=3", sink):
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)

@@ -58,7 +58,7 @@ def test_live_a_clock_that_is_set_back_is_learned_again() -> None:
 
 
 @given(st.lists(st.tuples(st.floats(0.001, 1.0), st.integers(0, 300)), min_size=1, max_size=80))
-def test_live_times_neither_run_backwards_nor_ahead(steps: list[tuple[float, int]]) -> None:
+def test_live_times_never_run_backwards_or_ahead(steps: list[tuple[float, int]]) -> None:
     clock, stamp_s, arrived, before = LiveClock(window_s=2.0), 0.0, 0, -(10**18)
     for step_s, delay_ms in steps:
         stamp_s += step_s

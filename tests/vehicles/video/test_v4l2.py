@@ -160,7 +160,7 @@ def test_a_disabled_setting_is_none(webcam: Webcam) -> None:
     assert V4l2Device(7, webcam).control(v4l2.GAIN) is None
 
 
-def test_a_file_that_is_no_camera_is_reported(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_camera_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "video0"
     path.touch()
     assert DeviceOptions(gain=3).configure(str(path)) == ["the camera's gain can't be set"]

@@ -1,8 +1,8 @@
 """Read and write the drone's configuration, and set the drone up after each link loss. Pure.
 
-``CONFIG`` writes a key once the acknowledge bit in navdata is clear. The drone sets the bit when it has received the
-command, which does not mean that it accepted the value; ``CTRL 5`` clears the bit for the next command. ``CTRL 4``
-makes the drone send all keys over a TCP connection; :attr:`Configurator.wants_dump` requests that connection.
+``CONFIG`` writes a key, and is sent once the acknowledge bit in navdata is clear. The drone sets the bit on receiving
+the command, even if it does not accept the value; ``CTRL 5`` clears the bit for the next command. ``CTRL 4`` makes the
+drone send all keys over a TCP connection; :attr:`Configurator.wants_dump` requests that connection.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skyloop.vehicles.ardrone.wire.at import AtMessage, Ctrl
 from skyloop.vehicles.ardrone.wire.configuration import END_OF_DUMP, format_value, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
 
-REPEAT_NS: Final = nanoseconds(0.15)  #: time between repeats of an unacknowledged CONFIG: two periods of demo mode
+REPEAT_NS: Final = nanoseconds(0.15)  #: repeat interval of an unacknowledged CONFIG: over two periods of demo mode
 REPEAT_DUMP_NS: Final = nanoseconds(0.3)  #: time between repeats of a request for the dump
 MAX_DUMP: Final = 1 << 18  #: maximum accepted size of a dump in bytes; real dumps have about 5000
 _CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
@@ -235,7 +235,7 @@ _ID_KEYS: Final = {
 
 
 def version_of(configuration: Mapping[str, str]) -> int | None:
-    """Return 1 or 2 according to the firmware or mother board in the configuration; None if both are missing."""
+    """Return 1 or 2, based on the firmware version or, without it, the mother board; None if neither is known."""
     major = configuration.get("general:num_version_soft", "").partition(".")[0]
     if major.isdecimal() and int(major) >= 1:
         return 1 if int(major) == 1 else 2
@@ -279,7 +279,7 @@ class Setup:
         self._remembered = remembered
 
     def steps(self, state: State) -> Iterator[Step]:
-        """Yield the steps, given the first state bits received; finish each one before fetching the next."""
+        """Yield the steps, given the drone's newest state bits; finish each step before fetching the next."""
         options, configurator = self._options, self._configurator
         in_demo = bool(state & State.DEMO)
         if state & State.BOOTSTRAP or in_demo is options.full:

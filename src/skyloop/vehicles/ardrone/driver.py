@@ -17,7 +17,7 @@ from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.ardrone.configuration import own_ids
 from skyloop.vehicles.ardrone.link import ArdroneLink
 from skyloop.vehicles.ardrone.options import options_of
-from skyloop.vehicles.ardrone.parameters import Commands, Entry, active_camera, entries_of, taken, written
+from skyloop.vehicles.ardrone.parameters import Commands, Entry, active_camera, entries_of, is_confirmed, prepare_write
 from skyloop.vehicles.ardrone.protocol import ArdroneSession
 from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.video import EncodedStream, VideoReceiver, cameras_of, make_decoder
@@ -38,10 +38,7 @@ class ArdroneDriver(Driver):
         self._camera = "front"
 
     def capabilities(self) -> Capabilities:
-        """Return the drone's capabilities.
-
-        The cameras are those of an AR.Drone 2 unless the address specifies version 1.
-        """
+        """Return the capabilities, with the cameras of an AR.Drone 2 unless the address specifies version 1."""
         version = self.options.version
         return Capabilities(
             vehicle=f"ardrone{version}" if version else "ardrone",
@@ -113,7 +110,7 @@ class ArdroneDriver(Driver):
         entries = self._entries()
         if not entries:
             raise ParameterError("the drone's configuration has not been read yet", code=Refusal.VEHICLE_LINK_LOST)
-        return self._configure(link, *written(entries, name, value))
+        return self._configure(link, *prepare_write(entries, name, value))
 
     def _configure(self, link: ArdroneLink, entry: Entry, text: str) -> Value:
         failure = link.write(entry.key, text)
@@ -123,7 +120,7 @@ class ArdroneDriver(Driver):
             session = link.session
             reported = session.configurator.values.get(entry.key, "")
             session.read_limits()
-            accepted = taken(entry, text, reported)
+            accepted = is_confirmed(entry, text, reported)
             if accepted:
                 session.remembered[entry.key] = reported
         if not accepted:
@@ -162,7 +159,7 @@ class ArdroneDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Return the active camera's intrinsics; intrinsics in the address apply to the front camera."""
+        """Return the front camera's intrinsics if the address has any; None for the bottom camera."""
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:

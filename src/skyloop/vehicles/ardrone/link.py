@@ -39,7 +39,7 @@ class ArdroneLink(VehicleLink[ArdroneSession]):
             self.session.send(message, times)
 
     def write(self, key: str, text: str) -> str | None:
-        """Write a key and read it back, within 0.9 s; return the failure or None. Not for the link's thread."""
+        """Write a key and read it back within 0.9 s; return the failure or None. Never call it on the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
@@ -111,7 +111,7 @@ def _discard(port: socket.socket) -> None:
 # The control port ----------------------------------------------------------------------------------------------------
 
 RETRY_NS: Final = nanoseconds(0.25)  #: time between attempts to connect to the control port
-_CHUNK: Final = 1 << 16
+_CHUNK: Final = 1 << 16  #: maximum number of bytes per read
 
 
 class DumpClient:

@@ -14,7 +14,7 @@ from skyloop.vehicles.ardrone.telemetry import OPTION_TAGS
 from skyloop.vehicles.ardrone.wire import at, configuration, navdata
 from skyloop.vehicles.ardrone.wire.navdata import Ports
 
-MAX_RATE_HZ: Final = 200.0
+MAX_RATE_HZ: Final = 200.0  #: rate of full navdata
 _Meaning = TypeVar("_Meaning")
 _VERSIONS: Final = {"auto": None, "1": 1, "2": 2}
 _MODES: Final = {"demo": False, "full": True}
@@ -35,7 +35,7 @@ class ArdroneOptions:
     version: int | None = None  #: the drone's version; None to read it from the configuration
     full: bool = False  #: whether to request navdata at 200 Hz with all options instead of the demo mode
     navdata_options: int | None = None  #: one bit per tag; None to leave the drone's configuration as it is
-    rate_hz: float = 50.0  #: maximum rate of feedback
+    rate_hz: float = 50.0  #: maximum rate of feedback with full navdata; demo mode has 15 Hz
     video: bool = True
     ids: bool = True  #: whether to use our own settings on an AR.Drone 2 (multi-configuration)
 

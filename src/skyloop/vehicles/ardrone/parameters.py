@@ -40,11 +40,11 @@ _TYPES: Final[dict[type, ParameterType]] = {
 }
 #: Keys that the driver writes itself or that are written by a parameter which checks the drone's state first.
 _OURS: Final = {
-    "general:navdata_demo": "the option navdata of the address decides",
-    "general:navdata_options": "the option navdata_options of the address decides",
-    "custom:session_id": "the driver decides",
-    "custom:profile_id": "the driver decides",
-    "custom:application_id": "the driver decides",
+    "general:navdata_demo": "set by the option navdata in the address",
+    "general:navdata_options": "set by the option navdata_options in the address",
+    "custom:session_id": "set by the driver",
+    "custom:profile_id": "set by the driver",
+    "custom:application_id": "set by the driver",
     "control:flight_anim": "write ardrone.flight_animation instead",
     "leds:leds_anim": "write leds.animation instead",
 }
@@ -61,22 +61,22 @@ class _Common:
     text: str = ""
 
 
-_MILLI: Final = 1000.0
+_MILLI: Final = 1000.0  #: divisor for the drone's mm and mm/s
 _COMMON: Final = (
-    _Common("limits.tilt", "control:euler_angle_max", "rad", 1.0, "greatest roll and pitch, in force now"),
-    _Common("limits.climb", "control:control_vz_max", "m/s", _MILLI, "greatest climb and descent, in force now"),
-    _Common("limits.yaw_rate", "control:control_yaw", "rad/s", 1.0, "greatest yaw rate, in force now"),
+    _Common("limits.tilt", "control:euler_angle_max", "rad", 1.0, "maximum roll and pitch, currently in force"),
+    _Common("limits.climb", "control:control_vz_max", "m/s", _MILLI, "maximum climb and descent, currently in force"),
+    _Common("limits.yaw_rate", "control:control_yaw", "rad/s", 1.0, "maximum yaw rate, currently in force"),
     _Common("limits.altitude", "control:altitude_max", "m", _MILLI, "ceiling; 100 means none"),
     *(
         common
         for where in ("indoor", "outdoor")
         for common in (
-            _Common(f"limits.{where}.tilt", f"control:{where}_euler_angle_max", "rad", 1.0, f"of {where} flight"),
-            _Common(f"limits.{where}.climb", f"control:{where}_control_vz_max", "m/s", _MILLI, f"of {where} flight"),
-            _Common(f"limits.{where}.yaw_rate", f"control:{where}_control_yaw", "rad/s", 1.0, f"of {where} flight"),
+            _Common(f"limits.{where}.tilt", f"control:{where}_euler_angle_max", "rad", 1.0, f"for {where} flight"),
+            _Common(f"limits.{where}.climb", f"control:{where}_control_vz_max", "m/s", _MILLI, f"for {where} flight"),
+            _Common(f"limits.{where}.yaw_rate", f"control:{where}_control_yaw", "rad/s", 1.0, f"for {where} flight"),
         )
     ),
-    _Common("camera.fps", "video:codec_fps", "1/s", 1, "pictures a second of the video"),
+    _Common("camera.fps", "video:codec_fps", "1/s", 1, "frame rate of the video"),
 )
 CHANNEL_KEY: Final = "video:video_channel"
 _CHANNELS: Final = {1: ("front", "bottom", "front_with_bottom", "bottom_with_front"), 2: ("front", "bottom")}
@@ -139,8 +139,8 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
     return found
 
 
-def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """Return the entry and the key's text for a new value; raise an error if the name or value is invalid."""
+def prepare_write(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
+    """Return the entry and the text to write for a new value; raise an error if the name or value is invalid."""
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -149,7 +149,7 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
     return entry, entry.to_text(value)
 
 
-def taken(entry: Entry, wanted: str, reported: str) -> bool:
+def is_confirmed(entry: Entry, wanted: str, reported: str) -> bool:
     """Return whether the drone reports the written value, regardless of its number format."""
     try:
         one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
@@ -252,7 +252,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
         value=names[int(text)],
         default=names[0],
         choices=names,
-        description=f"the camera whose pictures the drone sends ({CHANNEL_KEY})",
+        description=f"the camera whose video the drone sends ({CHANNEL_KEY})",
     )
     return Entry(parameter, CHANNEL_KEY, 0, names=names)
 
@@ -275,7 +275,7 @@ def _widened(parameter: Parameter) -> Parameter:
 #: Sends a command in each of a given number of ticks.
 Send = Callable[[AtMessage, int], None]
 
-_REPEATS: Final = 3
+_REPEATS: Final = 3  #: number of ticks in which a command is sent, because any datagram may be lost
 _MAGNETOMETER: Final = 0  #: device number for ``CALIB``
 _HALF_TURN: Final = 3.1416  #: π rounded up [rad], so that π itself is within the range
 
@@ -294,22 +294,20 @@ def _number(name: str, value: float, unit: str, low: float, high: float, descrip
     return Parameter(name, ParameterType.FLOAT, value, unit, low, high, value, description=description)
 
 
-_LEDS: Final = _animation("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
-_LEDS_FREQUENCY: Final = _number("leds.frequency", 2.0, "1/s", 0.1, 50.0, "of the next animation of the lights")
-_LEDS_DURATION: Final = _number(
-    "leds.duration", 3.0, "s", 0.0, 3600.0, "of the next one, in whole seconds; 0: for ever"
-)
+_LEDS: Final = _animation("leds.animation", LED_ANIMATIONS, "LED animation to play (LED); none: does nothing")
+_LEDS_FREQUENCY: Final = _number("leds.frequency", 2.0, "1/s", 0.1, 50.0, "frequency of the next LED animation")
+_LEDS_DURATION: Final = _number("leds.duration", 3.0, "s", 0.0, 3600.0, "its duration, in whole seconds; 0: forever")
 _TRIM: Final = _switch(
-    "ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only", momentary=True
+    "ardrone.flat_trim", "true: the drone uses its attitude as level (FTRIM); only on the ground", momentary=True
 )
 _CALIBRATE: Final = _switch(
     "ardrone.calibrate_magnetometer",
-    "true: the drone turns about itself to calibrate (CALIB); in flight only",
+    "true: the drone turns once on the spot to calibrate its magnetometer (CALIB); only in flight",
     momentary=True,
 )
 _ABSOLUTE: Final = _switch(
     "ardrone.absolute_control",
-    "roll and pitch are along ardrone.absolute_heading and not along the drone's nose (PCMD_MAG)",
+    "true: roll and pitch refer to ardrone.absolute_heading instead of the drone's nose (PCMD_MAG)",
     momentary=False,
 )
 _HEADING: Final = _number(
@@ -324,7 +322,7 @@ _HEADING: Final = _number(
 
 def _flight_animations(version: int | None) -> Parameter:
     known = FLIGHT_ANIMATIONS[:FIRST_FLIP] if version == 1 else FLIGHT_ANIMATIONS
-    text = "flies this animation (ANIM, sent once); in flight only"
+    text = "flight animation to perform (ANIM, sent once); only in flight"
     return _animation("ardrone.flight_animation", (name for name, _ in known), text)
 
 

@@ -27,11 +27,10 @@ _ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
 class PaveDecoder:
     """Decodes the frames of a PaVE stream: one frame in, at most one image out, without delay.
 
-    Returns nothing until the first key frame, because the stream may be torn and the drone sends a stale frame first.
-    After damage or a gap in the frame numbers, it returns nothing until the next key frame, because the images would be
-    smeared. ``waited`` counts the frames dropped for these reasons; ``damaged`` counts undecodable frames.
-
-    PaVE and H.264 have no checksum, so a flipped bit goes unnoticed if the stream remains valid. TCP has one.
+    Returns nothing until the first key frame, because the drone sends a stale frame first, and nothing after damage or
+    a gap in the frame numbers until the next key frame, because the images would be smeared. ``waited`` counts the
+    frames dropped for these reasons; ``damaged`` counts undecodable frames. PaVE and H.264 have no checksum (only TCP
+    has), so a flipped bit goes unnoticed if the stream remains valid.
     """
 
     def __init__(self) -> None:

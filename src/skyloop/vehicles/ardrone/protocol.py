@@ -54,9 +54,8 @@ class Sequencer:
 
 
 TICK_NS: Final = nanoseconds(0.03)  #: time between AT commands, as recommended in the drone's guide
-HURRY_NS: Final = nanoseconds(
-    0.01
-)  #: minimum time after a datagram before a new set-point is sent without waiting for its tick
+#: Minimum time after a datagram before a new set-point is sent without waiting for its tick.
+HURRY_NS: Final = nanoseconds(0.01)
 DEGRADED_NS: Final = nanoseconds(0.25)  #: time without data after which the link is DEGRADED
 LOST_NS: Final = nanoseconds(1.0)  #: time without data after which the link is LOST
 FIRST_WORD_NS: Final = nanoseconds(2.0)  #: time after which a drone that has sent nothing is reported as lost
@@ -80,7 +79,7 @@ class ArdroneSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.version = options.version  #: None until the drone's configuration has been read
+        self.version = options.version  #: from the address, or None until the drone's configuration has been read
         self.setpoints = SetpointController()
         self.configurator = Configurator()
         self.reception = Reception()
@@ -185,6 +184,7 @@ class ArdroneSession(VehicleSession):
     def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:
         captured_ns = self._clock.captured_ns(navdata, now_ns)
         climb = self._climb.climb(demo.altitude / 1000, captured_ns)
+        # 10 % early counts as due: otherwise, jitter would make feedback wait for yet another datagram.
         if self.options.full and now_ns - self._published_ns < 0.9e9 / self.options.rate_hz:
             return
         self._published_ns = now_ns
@@ -284,7 +284,7 @@ class ArdroneSession(VehicleSession):
         self._setups_failed = 0
         self.version = setup.version or self.version
         if setup.refused_ids:
-            text = "the drone keeps no settings of our own: they are shared with everybody who connects to it"
+            text = "the drone keeps no settings of our own: its settings are shared with everyone who connects to it"
             self._publish_event(message(text, "ids_refused", Severity.WARNING))
         self.ready = True
         self.read_limits()

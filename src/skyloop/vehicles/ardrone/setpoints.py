@@ -108,11 +108,9 @@ TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: time after which a drone still
 RISES_NS: Final = nanoseconds(3.0)  #: a rise within this time after sending a take-off is ours, not another program's
 #: Navdata reports the effect of the emergency bit within this time, both by the drone's clock and by ours.
 TOGGLE_NS: Final = nanoseconds(0.5)
-
-
 #: Below this height, complete a landing: navdata may be 0.25 s old, and the take-off bit would restart a landed drone.
 BREAK_OFF_M: Final = 0.5
-#: Control states in which a landing continues.
+#: Control states in which a landing may still be in progress.
 _LANDING_ON: Final = (ControlState.LANDING, ControlState.LANDED, None)
 
 
@@ -189,11 +187,11 @@ class SetpointController:
     # Decisions -------------------------------------------------------------------------------------------------
 
     def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept one of the driver's ``ACTIONS``.
+        """Accept one of the driver's ``ACTIONS`` and return the applied action.
 
-        Returns the applied action: an attitude within the drone's limits, or hover while the limits are unknown or an
-        emergency stop is in force. Raises :class:`DriverError` for a take-off while the drone is silent or in an
-        emergency, and for a reset while it is silent.
+        This is an attitude within the drone's limits, or hover while the limits are unknown or an emergency stop is in
+        force. Raises :class:`DriverError` for a take-off while the drone is silent, or in an emergency or stopped, and
+        for a reset while the drone is silent or has not confirmed the stop.
         """
         if isinstance(action, Idle):
             return action
@@ -282,7 +280,7 @@ class SetpointController:
         gap_ns = now_ns - self._received_ns
         passed_ns = gap_ns if passed_ns is None else passed_ns
         self._passed_ns += passed_ns
-        in_a_row = 2 * gap_ns < passed_ns  # a burst of delayed navdata; otherwise there is no backlog
+        in_a_row = 2 * gap_ns < passed_ns  # arrives over twice as fast as it was sent: a burst of delayed navdata
         if gap_ns >= SILENT_NS and self._received_ns:
             self._late_ns = gap_ns - passed_ns
         elif self._late_ns:

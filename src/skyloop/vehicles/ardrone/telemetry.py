@@ -38,8 +38,8 @@ from skyloop.vehicles.ardrone.wire.navdata import (
 #: Period of the drone's datagrams: in demo mode, as before its set-up (True), and with all options (False).
 PERIODS_NS: Final = {True: nanoseconds(1 / 15), False: nanoseconds(1 / 200)}
 RESTART_SILENCE_NS: Final = nanoseconds(0.2)  #: gap after which a lower number means a restart, not a late datagram
-_MICROSECOND_BITS: Final = 21
-_TIME_WRAP_S: Final = 1 << 11
+_MICROSECOND_BITS: Final = 21  #: lower bits of the option ``time``; the others are seconds
+_TIME_WRAP_S: Final = 1 << 11  #: the 11 bits of seconds wrap around at this value
 
 
 class Reception:
@@ -99,8 +99,8 @@ class Reception:
 class DroneClock:
     """Determines the capture time of a datagram's state on this host's clock.
 
-    Without the option ``time``, this is the datagram's arrival time; with it, this is the drone's stamp corrected by
-    the smallest recent delay. Times never go backwards.
+    This is the stamp in the option ``time``, taking the smallest recent delay as zero, or without that option the
+    datagram's arrival time. Times never go backwards.
     """
 
     def __init__(self) -> None:
@@ -264,14 +264,14 @@ _CONDITIONS: Final = (
     (State.BATTERY_LOW, "battery_low", "the drone's battery is low", Severity.WARNING),
     (State.ULTRASOUND_DEAF, "ultrasound", "the drone's ultrasound receives no echo", Severity.WARNING),
     (State.MOTORS_PROBLEM, "motors", "the drone has a problem with its motors", Severity.ERROR),
-    (State.SOFTWARE_FAULT, "software", "the drone detected a fault of its software", Severity.ERROR),
+    (State.SOFTWARE_FAULT, "software", "the drone detected a software fault", Severity.ERROR),
     (State.ANGLES_OUT_OF_RANGE, "angles", "the drone tilted too far", Severity.WARNING),
     (State.CUTOUT, "cutout", "a motor of the drone was blocked", Severity.WARNING),
     (State.WIND, "wind", "the wind is too strong for the drone", Severity.WARNING),
     (State.MAGNETOMETER_UNCALIBRATED, "magnetometer", "the drone's magnetometer needs calibration", Severity.INFO),
     (State.TIMER_ELAPSED, "timer", "the drone's timer elapsed", Severity.WARNING),
 )
-#: Reasons for cutting the motors that have a dedicated bit.
+#: State bits that say why the motors were cut.
 _REASONS: Final = (
     (State.USER_EMERGENCY, "user"),
     (State.ANGLES_OUT_OF_RANGE, "angles"),
@@ -316,7 +316,7 @@ def _emergency(state: State) -> VehicleEvent:
     if not state & State.EMERGENCY:
         return message("the drone left the emergency", "reset")
     reason = emergency_reason(state)
-    text = f"the drone cut its motors ({reason}); reset the emergency when it lies safely"
+    text = f"the drone cut its motors ({reason}); reset the emergency once it is lying safely on the ground"
     return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})
 
 

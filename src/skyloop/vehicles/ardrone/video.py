@@ -60,14 +60,14 @@ def cameras_of(uri: VehicleUri, version: int | None) -> tuple[CameraInfo, ...]:
 
 # Capture times -------------------------------------------------------------------------------------------------------
 
-_WRAP: Final = 1 << 32
+_WRAP: Final = 1 << 32  #: stamps wrap around at this value [ms]
 
 
 class DroneStamps:
     """Determines the capture times of one connection's frames.
 
-    Follows the drift of the drone's clock and the wrap-around of its stamps. Stamps that go back (after the drone
-    restarted) reset the estimate.
+    Follows the drift of the drone's clock and the wrap-around of its stamps. Stamps that go back, as after a restart of
+    the drone, reset the estimate.
     """
 
     def __init__(self) -> None:
@@ -89,8 +89,8 @@ class DroneStamps:
 class PaveAssembly:
     """Assembles the frames of one connection.
 
-    The first frame may be seconds old (seen in a capture from a real drone). The first frame is therefore held back
-    until the second one arrives, and is returned only if their numbers are consecutive.
+    The first frame may be seconds old (seen in a capture from a real drone). It is therefore held back until the second
+    one arrives, and returned only if their numbers are consecutive.
     """
 
     def __init__(self, connection: int) -> None:
@@ -143,7 +143,7 @@ POLL_S: Final = 0.1  #: maximum time that a read blocks
 SILENT_S: Final = 3.0  #: time without a complete frame after which the connection is closed
 KEEP_ALIVE_S: Final = 0.5  #: time between requests to an AR.Drone 1
 WAKE: Final = b"\x01\x00\x00\x00"  #: request to an AR.Drone 1: any small datagram starts the video and keeps it running
-_CHUNK: Final = 1 << 16
+_CHUNK: Final = 1 << 16  #: maximum number of bytes per read, and more than any datagram has
 
 
 class PaveStream(PaveAssembly):

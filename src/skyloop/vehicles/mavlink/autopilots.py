@@ -13,11 +13,18 @@ from typing import ClassVar, Final
 
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.mavlink.microservices import VehicleCommand
-from skyloop.vehicles.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
+from skyloop.vehicles.mavlink.telemetry import (
+    EKF_CONSTANT,
+    EKF_PLACE,
+    PREARM,
+    SLOW_S,
+    STANDARD_GRAVITY,
+    Telemetry,
+    VehicleState,
+)
 from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-STANDARD_GRAVITY: Final = 9.80665  #: m/s²
 CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error
 ALTITUDE_GAIN_PER_S2: Final = 0.8  #: acceleration per unit of altitude error, the integral of the climb rate error
 MOST_ALTITUDE_ERROR_M: Final = 1.5  #: limit of the altitude error
@@ -42,10 +49,10 @@ class ClimbRateThrust:
 
 
 class CollectiveThrust:
-    """The same field for PX4: collective thrust.
+    """The same field as collective thrust, for PX4, and for ArduCopter if its ``GUID_OPTIONS`` selects it.
 
     During one attitude-controlled flight, a proportional-integral loop holds the climb rate; its integral is an
-    altitude error. An implausible hover thrust (``MPC_THR_HOVER``) is replaced by 0.5.
+    altitude error. An implausible hover thrust is replaced by 0.5.
     """
 
     def __init__(self, hover: float) -> None:
@@ -69,10 +76,7 @@ class CollectiveThrust:
 ThrustModel = ClimbRateThrust | CollectiveThrust
 CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 REACHED_M: Final = 0.2  #: distance below its target altitude at which a take-off counts as complete
-EKF_PLACE: Final = 0x10  #: flag in EKF_STATUS_REPORT and ESTIMATOR_STATUS: absolute horizontal position
-EKF_RELATIVE_PLACE: Final = 0x08
-EKF_CONSTANT: Final = 0x80  #: flag in the same messages: the position is only assumed to be constant
-EKF_UNINITIALISED: Final = 0x400
+EKF_UNINITIALISED: Final = 0x400  #: flag in EKF_STATUS_REPORT
 THRUST_AS_THRUST: Final = 8  #: bit of ArduCopter's GUID_OPTIONS: the thrust field is collective thrust
 
 Values = Mapping[str, float]  #: parameter values keyed by the autopilot's own names
@@ -80,10 +84,7 @@ Values = Mapping[str, float]  #: parameter values keyed by the autopilot's own n
 
 @dataclass(frozen=True, slots=True)
 class _SafetyNet:
-    """One of the autopilot's failsafes, configured by a parameter.
-
-    The effect of each value was observed with the real autopilots or is documented in their parameter references.
-    """
+    """An autopilot failsafe set by a parameter. Effects were observed, or are in the parameter references."""
 
     name: str  #: name of the parameter
     what: str
@@ -153,7 +154,7 @@ class AutopilotProfile(ABC):
         """Return the model that turns climb rates into thrust."""
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
-        """Return a diagnostic for each safety net that one of this autopilot's parameters controls.
+        """Return a diagnostic for each safety net.
 
         By default, if this computer or its link fails, both autopilots merely stop following the last set-point.
         """
@@ -203,8 +204,7 @@ class ArduCopterProfile(AutopilotProfile):
         ekf = telemetry.newest("EKF_STATUS_REPORT", now_ns, SLOW_S)
         if not good or ekf is None:
             return good
-        knows = ekf.flags & (EKF_PLACE | EKF_RELATIVE_PLACE)
-        return bool(knows) and not ekf.flags & (EKF_CONSTANT | EKF_UNINITIALISED)
+        return bool(ekf.flags & EKF_PLACE) and not ekf.flags & (EKF_CONSTANT | EKF_UNINITIALISED)
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
         """Return every required message: by default, ArduCopter sends only a heartbeat every second."""
@@ -228,7 +228,7 @@ class ArduCopterProfile(AutopilotProfile):
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
 
     def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:
-        """Return diagnostics for the safety nets and for the vehicle's monitoring of our heartbeats."""
+        """Return diagnostics for the safety nets, and for the system whose heartbeats the vehicle monitors."""
         diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
@@ -255,18 +255,11 @@ class Px4Profile(AutopilotProfile):
     SAFETY_NETS = (
         _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "it only drops the last set-point", 1),
         _SafetyNet("COM_DL_LOSS_T", "time until its loss counts", lambda s: s <= 10, "it takes over 10 s", 5, "s"),
-        _SafetyNet(
-            "COM_OF_LOSS_T",
-            "time until set-points are missed",
-            lambda s: s <= 1,
-            "it keeps flying for too long",
-            1,
-            "s",
-        ),
+        _SafetyNet("COM_OF_LOSS_T", "set-point timeout", lambda s: s <= 1, "it takes over 1 s", 1, "s"),
         _SafetyNet(
             "COM_OBL_RC_ACT",
             "loss of set-points",
-            lambda action: action in (3, 4, 5),
+            lambda action: action in (3, 4, 5),  # return, land, hold
             "without a remote control it sinks to the ground",
             5,
         ),
@@ -309,10 +302,10 @@ class Px4Profile(AutopilotProfile):
         if self.mode_of(custom_mode) == self.ARMING:
             return False
         estimator = telemetry.newest("ESTIMATOR_STATUS", now_ns, SLOW_S)
-        return None if estimator is None else bool(estimator.flags & (EKF_PLACE | EKF_RELATIVE_PLACE))
+        return None if estimator is None else bool(estimator.flags & EKF_PLACE)
 
     def message_rates(self, rate_hz: float) -> dict[str, float]:
-        """Return the required messages. The heartbeat's rate is fixed; CURRENT_MODE is requested separately."""
+        """Return the required messages. The heartbeat stays at 1 Hz, so CURRENT_MODE is needed to see modes in time."""
         return {
             "ATTITUDE": rate_hz,
             "LOCAL_POSITION_NED": rate_hz,

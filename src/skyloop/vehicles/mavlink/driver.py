@@ -1,4 +1,4 @@
-"""The driver for ``mavlink://`` addresses, through which the proxy uses the vehicle."""
+"""The driver for ``mavlink://``, which combines the link, the camera and the parameters."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class MavlinkDriver(Driver):
         link.send(pose_message(bounded, self.options.pose))
 
     def checkup(self) -> list[Diagnostic]:
-        """Return a diagnostic for each of the autopilot's own failsafes, with the recommended setting."""
+        """Return diagnostics for arming and for each of the autopilot's own failsafes, with recommended settings."""
         link = self._opened()
         with link.lock:
             session = link.session

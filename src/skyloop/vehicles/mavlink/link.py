@@ -19,7 +19,7 @@ from skyloop.vehicles.mavlink.protocol import MavlinkSession, Packet
 from skyloop.vehicles.mavlink.wire.codec import Message
 
 MAX_DATAGRAM: Final = 65_536  #: bytes
-BURST: Final = 64  #: maximum number of datagrams per read, so that other links get their turn
+BURST: Final = 64  #: maximum number of datagrams per read, so that other links of the thread get their turn
 
 
 class UdpListener:
@@ -45,16 +45,16 @@ class UdpListener:
 
     def receive(self) -> list[tuple[bytes, Peer]]:
         """Return up to :data:`BURST` received datagrams, each with its sender."""
-        came: list[tuple[bytes, Peer]] = []
+        received: list[tuple[bytes, Peer]] = []
         for _ in range(BURST):
             try:
                 data, source = self._socket.recvfrom(MAX_DATAGRAM)
-                came.append((data, _peer_of(source)))
+                received.append((data, _peer_of(source)))
             except BlockingIOError:
                 break
             except ConnectionError:  # ICMP port unreachable, but the peer may come back
                 continue
-        return came
+        return received
 
     def send(self, packet: Packet) -> None:
         """Send a datagram; drop it if there is no peer yet or the buffer is full."""
@@ -172,7 +172,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             close_s=_CLOSE_S,
             serve=serve if udp else None,
         )
-        self._silent_ns = None if udp else nanoseconds(8.0)
+        self._silent_ns = None if udp else nanoseconds(8.0)  # a stream may stay open although its vehicle is gone
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
@@ -187,7 +187,7 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
             self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter; return why it failed, or None. Blocks up to 0.9 s: don't call it on the link's thread."""
+        """Write a parameter within 0.9 s; return the failure or None. Never call it on the link's thread."""
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
@@ -199,10 +199,10 @@ class MavlinkLink(ConnectionLink[MavlinkSession, MavlinkConnection]):
     # On the link's thread ----------------------------------------------------------------------------------------
 
     def _read(self, connection: MavlinkConnection) -> None:
-        came = connection.receive()
+        received = connection.receive()
         now_ns = self._clock()
         with self.lock:
-            for data, peer in came:
+            for data, peer in received:
                 self.session.receive(data, peer, now_ns, whole=connection.whole)
 
     def _send_due(self, now_ns: int) -> None:

@@ -15,7 +15,7 @@ from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-# Frames in SET_POSITION_TARGET_LOCAL_NED that both autopilots accept.
+# Frames (MAV_FRAME) that both autopilots accept in SET_POSITION_TARGET_LOCAL_NED, and type masks of ignored fields.
 WORLD: Final = 1
 BODY: Final = 8  #: levelled body axes
 VELOCITY_AND_YAW_RATE: Final = 0x5C7
@@ -101,7 +101,7 @@ class PositionSetpoint:
         self._before_ns = 0
 
     def replace(self, action: Position) -> None:
-        """Fly to another position, starting from where the vehicle is now."""
+        """Fly to another position, starting from the position last sent."""
         if self.action.yaw is not None and action.yaw is None:
             self._keep_yaw = None  # keep the vehicle's present heading
         self.action = action
@@ -111,7 +111,7 @@ class PositionSetpoint:
         self._at = self._yaw = None
 
     def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
-        """Return the set-point if one is due; the velocity is zero while the position or heading is unknown."""
+        """Return the set-point, which is a velocity of zero while the position or heading is unknown."""
         if vehicle.position is None or vehicle.yaw is None:
             self.hold_back()
             return velocity_message(Velocity(), target)
@@ -197,7 +197,7 @@ LANDED_NS: Final = nanoseconds(2.5)  #: time within which a landing disarms the 
 ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
 LEFT_GROUND_M: Final = 0.3  #: climb that counts as a lift-off if the vehicle does not report a lift-off
 CUT_SHORT: Final = 0.5  #: a hold below this fraction of the height means that another operator stopped a take-off
-CUT_SHORT_M: Final = 1.05  #: and the minimum shortfall: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
+CUT_SHORT_M: Final = 1.05  #: and at least this far below: PX4 ends a take-off NAV_MC_ALT_RAD (0.8 m) below its height
 STRAYED_NS: Final = nanoseconds(0.6)  #: how long another mode must be reported to count: messages may be reordered
 STALLED_NS: Final = nanoseconds(6.0)  #: time without progress after which a climb counts as cancelled
 
@@ -207,7 +207,7 @@ class TakeoffSequence:
 
     Each step requests what is missing: the mode for arming, then arming, then the command. Refusals are reported in the
     vehicle's own words, and refused steps are retried while the take-off is requested. ``asked_ns`` is the time of the
-    last request; ``disarms`` is whether the vehicle was found armed and our unfinished landing may still disarm it.
+    last request; ``disarms`` is whether our unfinished landing may still disarm the vehicle.
     """
 
     def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int, *, disarms: bool = False) -> None:
@@ -232,11 +232,11 @@ class TakeoffSequence:
         self._ground_m: float | None = None
         self._other_ns: int | None = None
         self._sent_ns = 0
-        self._seen = not autopilot.TAKING_OFF  # whether the vehicle's take-off mode, if it has one, was seen
+        self._seen = not autopilot.TAKING_OFF  # whether the take-off mode has been seen, if there is one
         self.refused = ""  #: why the vehicle is not armed yet
         self.arm_asked_ns: int | None = None  #: when arming was last requested; None if the vehicle was already armed
         self._arming_ns: int | None = None  # first arming request; earlier replies are to the landing's disarming
-        self._ready = False  # was in take-off mode, armed or about to be: any other mode is another operator's choice
+        self._ready = False  # arming was requested, or seen in our mode: another mode is another operator's choice
 
     @property
     def started(self) -> bool:

@@ -24,7 +24,7 @@ MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle
 MOST_OTHERS: Final = 16  #: maximum number of other vehicles reported: a hostile sender can invent any number of them
 _NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
 _GROUND_STATION: Final = m.MAV_TYPE_GCS
-#: MAV_TYPE of each kind of aircraft that hovers on several rotors.
+#: MAV_TYPE of multirotors and helicopters.
 _MULTIROTORS: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 
 
@@ -135,6 +135,7 @@ def unsupported_reason(heartbeat: Message) -> str:
     return ""
 
 
+# MAV_RESULT.
 ACCEPTED: Final = 0
 IN_PROGRESS: Final = 5
 _RESULTS: Final = ("accepted", "temporarily rejected", "denied", "unsupported", "failed", "in progress", "cancelled")
@@ -171,7 +172,7 @@ class CommandSender:
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
         if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
-            times = 0  # this is a new request, not a repeat
+            times = 0  # a new request: the confirmation field counts only repeats
         self._sent[command] = now_ns, times + 1
         arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
         self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
@@ -199,12 +200,10 @@ class CommandSender:
 
 
 AT_ONCE: Final = 4  #: maximum number of requests per tick, to leave room for other messages on a slow link
-RETRY_S: Final = 3.0  #: time after which a message that arrives too slowly is requested again
+RETRY_S: Final = 3.0  #: time after which a message that is missing or too slow is requested again
 ENOUGH: Final = 0.5  #: fraction of the requested rate that is good enough
 PATIENT_RETRY_S: Final = 20.0  #: retry interval after :data:`TRIES`, in case the vehicle does not have the message
 TRIES: Final = 4  #: number of requests at the shorter interval
-
-
 CHECK_NS: Final = nanoseconds(0.2)  #: time between checks of the rates once everything has been requested
 
 
@@ -303,8 +302,6 @@ class VehicleClock:
         return self._captured_ns
 
 
-WORLD: Final = m.MAV_FRAME_LOCAL_NED
-BODY: Final = m.MAV_FRAME_BODY_FRD
 _NAN: Final = math.nan
 
 
@@ -321,11 +318,9 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     if kind is PoseMessage.VISION:
         return m.MAVLink_vision_position_estimate_message(pose.captured_ns // 1000, *position, *angles, covariance, 0)
     q = to_wire(quaternion_from_euler(*angles))
-    unknown = [_NAN] * 21
-    estimator = m.MAV_ESTIMATOR_TYPE_MOCAP
-    return m.MAVLink_odometry_message(
-        pose.captured_ns // 1000, WORLD, BODY, *position, q, *[_NAN] * 6, covariance, unknown, 0, estimator, 100
-    )
+    time_us, frames = pose.captured_ns // 1000, (m.MAV_FRAME_LOCAL_NED, m.MAV_FRAME_BODY_FRD)
+    rest = [_NAN] * 21, 0, m.MAV_ESTIMATOR_TYPE_MOCAP, 100  # unknown covariance of the velocities
+    return m.MAVLink_odometry_message(time_us, *frames, *position, q, *[_NAN] * 6, covariance, *rest)
 
 
 def _covariance(pose: ExternalPose) -> list[float]:

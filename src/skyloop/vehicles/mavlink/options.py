@@ -48,12 +48,12 @@ OWN_LIMITS: Final = (
     OwnLimit(ALTITUDE, "altitude", 3.0, 0.5, 500.0, "m", "Maximum height above the take-off point"),
     OwnLimit("limits.climb", "climb", 1.0, 0.05, 10.0, "m/s", "Maximum vertical speed"),
     OwnLimit("limits.speed", "speed", 2.0, 0.05, 30.0, "m/s", "Maximum horizontal speed of a velocity set-point"),
-    OwnLimit(TAKEOFF_ALTITUDE, "takeoff_altitude", 1.5, 0.5, 50.0, "m", "Where a take-off ends, above its start"),
+    OwnLimit(TAKEOFF_ALTITUDE, "takeoff_altitude", 1.5, 0.5, 50.0, "m", "Height of a take-off above its start"),
 )
 USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
 
-KEY_BYTES: Final = 32
-DEFAULT_BAUD: Final = 57_600
+KEY_BYTES: Final = 32  #: size of a signing key
+DEFAULT_BAUD: Final = 57_600  #: usual speed of telemetry radios [bit/s]
 #: Rotations from a camera's optical axes (right, down, forward) to body axes, row by row. The top of the image points
 #: up or, for a camera that looks down, forward.
 FACINGS: Final = {
@@ -61,8 +61,8 @@ FACINGS: Final = {
     "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
 }
 _EXAMPLES: Final = (
-    "it looks like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, mavlink://tcp:127.0.0.1:5760 or "
-    "mavlink://serial:/dev/ttyACM0:921600"
+    "it should look like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, "
+    "mavlink://tcp:127.0.0.1:5760 or mavlink://serial:/dev/ttyACM0:921600"
 )
 KNOWN: Final = {
     *("sysid", "component", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "world_origin", "pose"),
@@ -189,7 +189,7 @@ def _peer(uri: VehicleUri) -> tuple[str, int] | None:
         return None
     found = host_and_port(given)
     if found is None:
-        raise UsageError(f"{uri}: peer is {given!r}; it looks like peer=127.0.0.1:14580 or peer=[fe80::1]:14580")
+        raise UsageError(f"{uri}: peer is {given!r}; it should look like peer=127.0.0.1:14580 or peer=[fe80::1]:14580")
     return found
 
 
@@ -217,7 +217,7 @@ def _origin(uri: VehicleUri, option: str) -> tuple[float, float, float] | None:
     except ValueError:
         latitude = longitude = altitude = float("nan")
     if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) <= 10_000):
-        raise UsageError(f"{uri}: {option} is {given!r}; it looks like {option}=47.3977,8.5456,488 (degrees and m)")
+        raise UsageError(f"{uri}: {option} is {given!r}; it should look like {option}=47.3977,8.5456,488 (degrees, m)")
     return latitude, longitude, altitude
 
 
@@ -236,7 +236,7 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
             raise UsageError(f"{uri}: {given[0]} is for a camera: give camera=rtsp://… as well")
         return None
     if not source:
-        raise UsageError(f"{uri}: camera is empty; it looks like camera=rtsp://192.168.1.10/live or camera=/dev/video0")
+        raise UsageError(f"{uri}: camera is empty; give camera=rtsp://192.168.1.10/live or camera=/dev/video0")
     name, facing = uri.options.get("camera_name", "front"), uri.options.get("camera_facing", "forward")
     if facing not in FACINGS:
         raise UnknownNameError("camera_facing of mavlink://", facing, FACINGS)

@@ -24,7 +24,7 @@ class FlightOwnership:
     """Decides who is flying, based on the modes that the vehicle reports and the modes requested here."""
 
     def __init__(self, autopilot: AutopilotProfile) -> None:
-        self.left_to = ""  #: foreign mode that now flies the vehicle; empty if we fly it or there is no pilot
+        self.foreign_mode = ""  #: mode, not chosen here, that now flies the vehicle; empty if there is none
         self._autopilot = autopilot
         self._by_itself = False  # whether its own failsafe chose the mode, in which we may still hold or land it
         self._steering = False  # whether this program started or took over the flight
@@ -37,7 +37,7 @@ class FlightOwnership:
     @property
     def others(self) -> str:
         """The mode in which another operator is flying the vehicle; empty if there is none."""
-        return "" if self._by_itself else self.left_to
+        return "" if self._by_itself else self.foreign_mode
 
     def is_foreign(self, vehicle: VehicleState) -> bool:
         """Return whether the mode can't be the result of any decision made here."""
@@ -60,12 +60,12 @@ class FlightOwnership:
         Repeating the same action in a loop does not count as a new decision. Raises :class:`DriverError`.
         """
         (_, at_ns), self._applied = self._applied, (type(action), now_ns)
-        if not self.left_to:
+        if not self.foreign_mode:
             return
         decided = new and (type(action) is not self._repeated or now_ns - at_ns > PAUSE_NS)
         if isinstance(action, _SET_POINTS) or not decided:
             raise DriverError(
-                f"the vehicle is in {self.left_to}, which was not chosen here: "
+                f"the vehicle is in {self.foreign_mode}, which was not chosen here: "
                 "hover, take off or land first to take it over"
             )
         self._repeated = None
@@ -78,7 +78,7 @@ class FlightOwnership:
         begins = not self._steering or not isinstance(action, _SET_POINTS)
         if alone or (new and begins):
             self._from = "" if vehicle is None else vehicle.mode
-        self._steering, self._by_itself, self.left_to = True, False, ""
+        self._steering, self._by_itself, self.foreign_mode = True, False, ""
 
     def on_mode_asked(self, mode: str, now_ns: int) -> None:
         """Record that we requested a mode."""
@@ -111,7 +111,7 @@ class FlightOwnership:
 
     def leave(self, vehicle: VehicleState) -> bool:
         """Leave the vehicle in its present mode; return whether we may still hold or land it."""
-        self.left_to, self._repeated = vehicle.mode, self._applied[0]
+        self.foreign_mode, self._repeated = vehicle.mode, self._applied[0]
         self._asked.clear()
         self._by_itself = self._steering = self._is_left_to_nobody(vehicle)
         return self._by_itself
@@ -122,6 +122,6 @@ class FlightOwnership:
 
     def on_flight_over(self) -> None:
         """Discard the state of the flight: the vehicle is on the ground, and its next pilot starts from scratch."""
-        self._steering, self._by_itself, self.left_to, self._from = False, False, "", ""
+        self._steering, self._by_itself, self.foreign_mode, self._from = False, False, "", ""
         self._foreign_ns, self._repeated = None, None
         self._asked.clear()

@@ -22,7 +22,7 @@ AT_ONCE: Final = 20  #: number of missing parameters requested at once
 LIST_NS: Final = nanoseconds(3.0)  #: time between requests for the list while nothing arrives
 GIVE_UP_NS: Final = nanoseconds(20.0)  #: stop reading after this long without a new parameter
 WRITE_NS: Final = nanoseconds(0.25)  #: time between repeats of an unconfirmed write
-NO_INDEX: Final = 0xFFFF
+NO_INDEX: Final = 0xFFFF  #: index of a PARAM_VALUE that is not part of the list, such as a reply to a write
 MOST: Final = 8192  #: longest plausible list; a greater count is ignored
 
 
@@ -272,7 +272,7 @@ def check_exact(name: str, number: int, *, bytewise: bool) -> int:
 
 
 def rounded(number: float) -> float:
-    """Return a number rounded to single precision."""
+    """Return a number rounded to 7 digits, as many as single precision holds."""
     return float(f"{number:.7g}")
 
 

@@ -109,7 +109,7 @@ class MavlinkSession(VehicleSession):
         self.setpoints: SetpointController | None = None  #: None until the autopilot is known, or if it can't be flown
         self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own limits
-        self.dropped = 0  #: number of packets that the connection dropped because its buffer was full
+        self.dropped = 0  #: number of packets that the connection dropped
         self._axes = WorldAxes(options.world_origin)
         self._extra = extra
         self._selector = VehicleSelector(options.system, options.peer, options.component)

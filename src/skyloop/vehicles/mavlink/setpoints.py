@@ -1,8 +1,8 @@
 """Turn the last action into the messages due at each tick. Pure.
 
-Set-points are streamed only while a pilot is at the controls and the vehicle is in the mode that follows them. A
-failsafe, a lost link or another operator's mode change (see :mod:`~skyloop.vehicles.mavlink.ownership`) ends the
-stream, after which only the vehicle's own safety nets control it.
+Set-points are streamed only while a pilot is at the controls and the vehicle is in, or is changing to, the mode that
+follows them. A failsafe, a lost link or another operator's mode change (see
+:mod:`~skyloop.vehicles.mavlink.ownership`) ends the stream; then only the vehicle's own safety nets control it.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-FORCE: Final = 21196.0  #: parameter of the disarm command that means "even in flight"
+FORCE: Final = 21196.0  #: argument of the disarm command that means "even in flight"
 DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
 CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
 SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off counts as complete in any mode after this time at its height
@@ -111,10 +111,10 @@ class SetpointController:
     ) -> AnyAction:
         """Accept an action; return the action in force, which is idle if the action is ignored.
 
-        While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused
-        and all other actions are ignored. ``alone``: whether a failsafe requested it while no pilot was in command;
-        ``new``: whether an application just requested it, as opposed to a repeat by the library. Raises
-        :class:`DriverError` if the action is not possible now, or another operator is flying the vehicle.
+        While an emergency stop is in force (see :class:`MotorStop`), a take-off is refused and all actions but the stop
+        and its reset are ignored. ``alone``: whether a failsafe requested it while no pilot was in command; ``new``:
+        whether an application just requested it, as opposed to a repeat by the library. Raises :class:`DriverError` if
+        the action is not possible now, or another operator is flying the vehicle.
         """
         if isinstance(action, Idle):
             return action
@@ -314,7 +314,7 @@ class SetpointController:
         """Return the set-points that are due, and pass commands to the command sender.
 
         ``read``: whether the vehicle seems to process commands promptly, judging by its messages. If not, a changed
-        velocity might wait in a buffer and take effect late, so only a stop is sent, which is harmless even when late.
+        velocity might wait in a buffer and take effect late, so zero velocity is sent, which is harmless even if late.
         """
         due, setpoint = self._due_messages(vehicle, now_ns), self._setpoint
         wanted = setpoint.action if isinstance(setpoint, VelocitySetpoint) else None

@@ -255,7 +255,7 @@ def finite(x: float, y: float, z: float) -> Vector | None:
 
 
 STANDARD_GRAVITY: Final = 9.80665  #: m/s²
-_UNKNOWN_16: Final = 0xFFFF
+_UNKNOWN_16: Final = 0xFFFF  #: unknown value of an unsigned 16-bit field
 _OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION of avionics and payload batteries
 
 
@@ -265,7 +265,7 @@ def feedback_of(
     """Return the vehicle's state in our units and axes. Values that are outdated or not finite are None."""
     attitude = telemetry.attitude(now_ns)
     position = telemetry.position(now_ns)
-    roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
+    roll, pitch, yaw = (None, None, None) if attitude is None else _to_our_axes(attitude)
     return Feedback(
         captured_ns=captured_ns,
         state=state,
@@ -283,7 +283,7 @@ def feedback_of(
     )
 
 
-def _turned_over(attitude: Vector) -> Vector:
+def _to_our_axes(attitude: Vector) -> Vector:
     """Convert to roll (positive right side down), pitch (positive nose down) and yaw (counter-clockwise from east)."""
     roll, pitch, yaw = attitude
     return math.remainder(roll, math.tau), 0.0 - math.remainder(pitch, math.tau), yaw_between(yaw)
@@ -358,12 +358,12 @@ def _geodetic(message: Message) -> dict[str, Value]:
     }
 
 
-DEBUG: Final = 7
+DEBUG: Final = 7  #: MAV_SEVERITY
 GOOD_FIX: Final = 3  #: fix type of a three-dimensional position
 _PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
 _EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
-_PLACE: Final = 0x10 | 0x08
-_LOST: Final = 0x80
+EKF_PLACE: Final = 0x10 | 0x08  #: flags of both: absolute horizontal position, and relative to the origin
+EKF_CONSTANT: Final = 0x80  #: flag of both: the position is only assumed to be constant
 _RISEN_NS: Final = nanoseconds(1.5)  #: time allowed from lift-off until the vehicle reports it (PX4: once per second)
 
 
@@ -420,7 +420,7 @@ class HealthMonitor:
             if ekf is not None:
                 # PX4 reports a constant position while on the ground; in the air that means that the position is lost.
                 counts = kind != "ESTIMATOR_STATUS" or risen
-                good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
+                good = bool(ekf.flags & EKF_PLACE) and not (counts and ekf.flags & EKF_CONSTANT)
                 events += self._changed(
                     "ekf", good, "the vehicle knows where it is", "the vehicle does not know where it is"
                 )

@@ -1,4 +1,4 @@
-"""A vehicle that records its commands, and a board on a clock that the tests move."""
+"""A vehicle that records its commands, and an emulated drone on a manual clock."""
 
 from __future__ import annotations
 

@@ -305,7 +305,7 @@ def test_a_flip_in_flight_is_recorded_only(by_key: bool) -> None:
             bench.say("ANIM", 18, 15)
     flight = bench.logic.flight
     assert flight.animation is not None
-    assert flight.animation.number == 18
+    assert flight.animation[0] == 18
     assert flight.flipping(bench.clock())
     assert not flight.flipping(bench.clock.advance(0.015))
     assert bench.vehicle.told == []

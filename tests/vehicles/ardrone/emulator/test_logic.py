@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.messages import FlightState
-from skyloop.vehicles.ardrone.emulator.logic import LedAnimation, VideoSettings
+from skyloop.vehicles.ardrone.emulator.logic import VideoSettings
 from skyloop.vehicles.ardrone.wire.at import to_bits
 from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec, parse_dump
 from skyloop.vehicles.ardrone.wire.navdata import State
@@ -127,9 +127,9 @@ def test_a_drone_without_any_client_reports_no_lost_link() -> None:
 def test_lights_are_recorded() -> None:
     bench = Bench()
     bench.say("LED", 3, 2.5, 4)
-    assert bench.logic.leds == LedAnimation(3, 2.5, 4)
+    assert bench.logic.leds == (3, 2.5, 4)
     bench.configure("leds:leds_anim", f"1,{to_bits(0.5)},6")
-    assert bench.logic.leds == LedAnimation(1, 0.5, 6)
+    assert bench.logic.leds == (1, 0.5, 6)
 
 
 def test_the_configuration_selects_the_video() -> None:

@@ -163,7 +163,7 @@ def test_each_listener_has_its_own_sequence() -> None:
     assert dict(listeners.next_sequences()) == {first: 2, second: 1}
 
 
-def test_a_listener_too_many_replaces_the_one_with_the_oldest_request() -> None:
+def test_an_excess_listener_replaces_the_one_with_the_oldest_request() -> None:
     listeners = Listeners()
     for port in range(MOST):
         listeners.refresh(("127.0.0.1", port))

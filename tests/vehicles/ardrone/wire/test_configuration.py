@@ -58,7 +58,7 @@ def test_vectors_survive_a_round_trip(values: list[float]) -> None:
 
 
 @pytest.mark.parametrize(("text", "like"), [("1", True), ("true", True), ("0.25", 0.0), (" 7 ", 0)])
-def test_other_ways_to_write_them(text: str, like: Value) -> None:
+def test_alternative_spellings_of_values(text: str, like: Value) -> None:
     assert parse_value(text, like) == (0.25 if like == 0.0 and isinstance(like, float) else 7 if like == 0 else True)
 
 
@@ -81,7 +81,7 @@ def test_a_dump_survives_a_round_trip() -> None:
         assert format_value(parse_value(texts[name], value)) == format_value(value)
 
 
-def test_a_dump_by_hand() -> None:
+def test_a_dump_written_by_hand() -> None:
     dump = (
         b"general:num_version_config            = 1\n"
         b"general:num_version_soft              = 1.7.4\r\n"

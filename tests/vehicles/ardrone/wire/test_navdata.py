@@ -134,7 +134,7 @@ def test_unknown_options_are_listed() -> None:
     assert navdata.unknown == ((99, 7), (0, 8)), "a known tag with another size is also unknown"
 
 
-def test_an_option_by_hand() -> None:
+def test_an_option_written_by_hand() -> None:
     body = header(0x0F8004D0, 77) + struct.pack("<HHI", 26, 8, 87)
     navdata = decode(with_checksum(body))
     assert (navdata.state, navdata.sequence, navdata.get(Wifi)) == (0x0F8004D0, 77, Wifi(87))

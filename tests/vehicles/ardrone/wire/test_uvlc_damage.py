@@ -29,7 +29,7 @@ def outcome(data: bytes) -> UvlcPicture | None:
 
 
 @pytest.mark.parametrize("data", SHOWN)
-def test_no_torn_packet_is_a_picture(data: bytes) -> None:
+def test_a_torn_packet_is_not_a_picture(data: bytes) -> None:
     assert outcome(data) is not None
     for size in range(0, len(data), 4 if len(data) < 3000 else 36):
         assert outcome(data[:size]) is None
@@ -44,7 +44,7 @@ def test_a_missing_piece_raises_nothing_else(data: bytes, at: int, size: int) ->
 @given(packets, st.binary(min_size=1, max_size=300))
 @example(SHOWN[0], bytes(4))
 @example(SHOWN[0], bytes(8))
-def test_no_packet_with_more_after_it_is_a_picture(data: bytes, more: bytes) -> None:
+def test_a_packet_with_trailing_data_is_not_a_picture(data: bytes, more: bytes) -> None:
     decoded = outcome(data + more)
     assert (decoded is None) == (len(more) != 4 or any(more))
 
@@ -59,7 +59,7 @@ def test_flipped_bits_raise_nothing_else(data: bytes, places: list[int]) -> None
 
 @given(st.binary(max_size=400))
 @example(b"")
-def test_random_bytes_are_no_picture(data: bytes) -> None:
+def test_random_bytes_are_not_a_picture(data: bytes) -> None:
     assert outcome(data) is None
 
 

@@ -268,7 +268,7 @@ def test_a_signature_is_never_repeated_after_the_clock_goes_back(monkeypatch: py
         wall.now_s -= 10.0
 
 
-def test_a_sender_without_the_key_locks_nobody_out() -> None:
+def test_a_sender_without_the_key_locks_no_one_out() -> None:
     """A forged frame from the far future changes nothing."""
     ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
     forged = bytearray(vehicle.encode(attitude()))

@@ -98,7 +98,7 @@ def test_a_repeated_or_late_chunk_makes_no_other_text() -> None:
     assert whole_texts([first, last, *again]) == ["a" * 50 + "b" * 10, "c" * 50 + "d" * 10], "after a reboot"
 
 
-def test_texts_that_never_end_are_returned_and_dropped() -> None:
+def test_texts_without_an_end_are_returned_and_dropped() -> None:
     texts = Texts()
     told = [whole for n in range(1, 40) for whole in texts.on_message(travelled(chunks_of("x" * 60, 4, n))[0])]
     assert len(told) == 31
@@ -135,7 +135,7 @@ def test_headings_turn_both_ways(yaw: float) -> None:
     assert abs(math.remainder(axes.yaw_between(axes.yaw_between(yaw)) - yaw, math.tau)) < 1e-9
 
 
-def test_north_is_north() -> None:
+def test_north_stays_north() -> None:
     assert axes.yaw_between(0.0) == pytest.approx(math.pi / 2)
     assert axes.swap(1.0, 2.0, 3.0) == (2.0, 1.0, -3.0)
     assert axes.flip(1.0, 2.0, 3.0) == (1.0, -2.0, -3.0)

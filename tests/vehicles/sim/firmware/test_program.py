@@ -108,7 +108,7 @@ def test_its_last_output_is_in_the_event_and_the_folder_stays(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("code", [129, 255])
-def test_an_exit_code_is_no_signal_unless_there_is_one_of_its_number(code: int) -> None:
+def test_an_exit_code_is_not_a_signal_unless_one_has_its_number(code: int) -> None:
     told = {129: "Testware was killed by SIGHUP", 255: "Testware ended with exit code 255"}
     with Watched((sys.executable, "-S", "-c", f"import os; os._exit({code})")) as watched:
         watched.next(FirmwareEventKind.STARTED)

@@ -113,8 +113,8 @@ class Listeners:
 
 MOST_CLIENTS: Final = 8  #: maximum number of clients of a TCP port
 MOST_BACKLOG: Final = 256 * 1024  #: maximum number of bytes queued for one client in addition to the system's buffer
-_SYSTEM_BUFFER: Final = 64 * 1024
-_READ: Final = 4096
+_SYSTEM_BUFFER: Final = 64 * 1024  #: size of the system's send buffer for one client [bytes]
+_READ: Final = 4096  #: maximum number of bytes per read
 
 
 class Outlet:
@@ -190,7 +190,7 @@ class Outlet:
 
 
 class StreamPort:
-    """A TCP port that sends to its clients and discards what they send. Use only on the loop's thread."""
+    """A TCP port that sends to its clients and discards their data. Use only on the loop's thread."""
 
     def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
         self._loop = loop
@@ -248,7 +248,7 @@ class RunningFirmware(RunningEmulator):
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
         self._demo_due_ns = 0
-        self._stale = b""  # the last frame sent, if it depends on earlier ones
+        self._stale = b""  # the last frame that depends on earlier ones
         self._navdata_clients, self._video_clients = Listeners(), Listeners()
         self._most_thrust = host.simulation.parameters[drone].most_thrust
         vehicle = SimulatedVehicle(host.simulation, drone)
@@ -415,8 +415,8 @@ VERSIONS: Final = (1, 2)
 class ArdroneFirmware(Emulator[RunningFirmware]):
     """The firmware of one drone in a host's world. Several drones can share a host, each with its own ports.
 
-    Create the host with options from :func:`with_ardrones`. Full navdata is sent at the host's report rate
-    (:attr:`skyloop.sim.options.SimOptions.rate_hz`), but at 125 Hz at most; real drones send it at 200 Hz.
+    Create the host with options from :func:`with_ardrones`. Full navdata is sent at the host's report rate, which they
+    set to 125 Hz; real drones send it at 200 Hz.
 
     Args:
         host: The simulated world.
@@ -427,9 +427,8 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         faults: Injected into the datagrams of AT commands, navdata and an AR.Drone 1's video, in both directions.
         delay_s: Delay added to those datagrams in each direction.
         header_size: Size of the PaVE headers: 68 bytes, or 64 as in early firmware.
-        torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame sent to another
-            client, however old, and then the frames that follow, key frames or not. If False, its stream begins with
-            the next key frame.
+        torn_start: Whether, as with a real AR.Drone 2, a new video client first gets the last frame that is not a key
+            frame, however old, and then the frames that follow. If False, its stream begins with the next key frame.
 
     Raises:
         UsageError: The version or header size is unknown, or the delay is out of range.

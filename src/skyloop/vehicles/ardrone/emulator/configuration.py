@@ -34,8 +34,8 @@ _DESCRIPTIONS: Final = {
     Category.USER: ("[profiles]", "custom:profile_desc"),
     Category.SESSION: ("[sessions]", "custom:session_desc"),
 }
-#: Limits that come in three versions: the current limit, one for indoors and one for outdoors.
-TWOFOLD: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
+#: Limits with separate keys for indoors and outdoors, besides the key for the limit in force.
+PLACE_LIMITS: Final = ("euler_angle_max", "control_vz_max", "control_yaw")
 #: Values in the emulated firmware (2.4.8 and 1.7.4) that differ from the usual defaults.
 _FACTORY: Final[dict[int, dict[str, Value]]] = {
     1: {
@@ -88,8 +88,8 @@ class Configuration:
     def write(self, name: str, text: str, ids: Ids | None = None) -> bool:
         """Handle a ``CONFIG`` with the ids received immediately before it, if any; return whether it was accepted.
 
-        While a custom session, user or application is active, only commands with its ids are accepted, except for
-        ``custom:…_id``: otherwise no other client could ever start a custom one.
+        While a custom session, user or application is active, only commands with its ids are accepted. The keys
+        ``custom:…_id`` are exempt: otherwise no other client could ever start its own.
         """
         name = name.strip().lower()
         key = self._keys.get(name)
@@ -136,11 +136,11 @@ class Configuration:
         section, _, word = name.partition(":")
         place = "outdoor" if self["control:outdoor"] else "indoor"
         if name == "control:outdoor":
-            for limit in TWOFOLD:
+            for limit in PLACE_LIMITS:
                 self._store(f"control:{limit}", self[f"control:{place}_{limit}"])
-        elif section == "control" and word in TWOFOLD:
+        elif section == "control" and word in PLACE_LIMITS:
             self._values[category][self._ids[category]][f"control:{place}_{word}"] = value
-        elif section == "control" and word.removeprefix(f"{place}_") in TWOFOLD:
+        elif section == "control" and word.removeprefix(f"{place}_") in PLACE_LIMITS:
             self._store(f"control:{word.removeprefix(f'{place}_')}", value)
 
     def _choose(self, category: Category, text: str) -> bool:
@@ -167,7 +167,7 @@ class Configuration:
         session.update({name: self._ids[category] for name, category in _ID_KEYS.items()})
 
     def _understood(self, key: Key, text: str) -> Value | None:
-        """Return the value that a text stands for; None if the text is invalid."""
+        """Parse the text of a key's value; return None if it is invalid."""
         try:
             value = parse_value(text, _as_number(key.default))
         except DecodeError:
@@ -193,5 +193,5 @@ class Configuration:
 
 
 def _as_number(default: Value) -> Value:
-    """Allow a decimal point in whole numbers, as the firmware's C code does."""
+    """Return a number as a float, because the firmware's C code allows a decimal point in whole numbers."""
     return float(default) if isinstance(default, int) and not isinstance(default, bool) else default

@@ -22,6 +22,7 @@ from skyloop.sim.parameters import GRAVITY_M_S2, LIMIT_RANGES, Limits
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration
 from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
+from skyloop.vehicles.ardrone.wire.configuration import FIRST_FLIP, FLIGHT_ANIMATIONS
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.emulation.flight import Vehicle
 
@@ -74,17 +75,13 @@ def set_point(
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
         # The command is relative to the remote control's heading: rotate it by the difference to the drone's heading.
-        right, ahead = turned(right, ahead, _clockwise_from_north(yaw_rad) - progress.heading * math.pi)
+        right, ahead = turned(right, ahead, (math.pi / 2 - yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")
     if progress.flags & Pcmd.COMBINED_YAW and int(configuration.number("control:control_level")) & _COMBINED_YAW_LEVEL:
         yaw_rate -= GRAVITY_M_S2 * math.tan(roll) / max(forward_m_s, _LEAST_TURNING_SPEED_M_S)
     climb = clamped(progress.gaz, 1.0) * configuration.number("control:control_vz_max") / 1000
     return Attitude(roll, pitch, climb, yaw_rate)
-
-
-def _clockwise_from_north(yaw_rad: float) -> float:
-    return math.pi / 2 - yaw_rad
 
 
 def _possible(name: str, value: float) -> float:
@@ -96,18 +93,8 @@ LOST_AFTER_S: Final = 2.0  #: time without commands before the link counts as lo
 CUT_OUT_TILT_RAD: Final = math.radians(60)  #: tilt that cuts the motors; an estimate, because no source gives the angle
 BATTERY_RECOVERY_MV: Final = 500  #: margin above vbat_min at which a battery no longer counts as low; an estimate
 CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn in about 4 s; an estimate
-FIRST_FLIP: Final = 16
-LAST_ANIMATION: Final = 19
 
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
-
-
-@dataclass(frozen=True, slots=True)
-class Animation:
-    """A requested flight animation, which is stored but not flown."""
-
-    number: int
-    until_ns: int
 
 
 class FlightControl:
@@ -125,16 +112,13 @@ class FlightControl:
         self.battery_low = False
         self.trim_rad = (0.0, 0.0)  #: roll and pitch measured by FTRIM, subtracted in navdata
         self.progress = NO_PROGRESS  #: the last valid PCMD or PCMD_MAG
-        self.animation: Animation | None = None
+        self.animation: tuple[int, int] | None = None  #: number and end [ns] of the animation last requested
         self.calibrations = 0  #: number of magnetometer calibrations started so far
 
     # Commands --------------------------------------------------------------------------------------------------
 
     def ref(self, bits: int) -> None:
-        """Handle ``REF``: take off, land, toggle the emergency.
-
-        The fixed bits are not checked, because some programs omit them.
-        """
+        """Handle ``REF``: take off, land, toggle the emergency. Fixed bits are not checked: some programs omit them."""
         self.start = bool(bits & Ref.TAKEOFF)
         if bits & Ref.EMERGENCY:
             if self._toggle_ready:
@@ -148,9 +132,9 @@ class FlightControl:
             self._vehicle.command(Land())
 
     def follow(self, progress: Progress, now_ns: int) -> None:
-        """Handle ``PCMD`` or ``PCMD_MAG``.
+        """Handle ``PCMD`` or ``PCMD_MAG``; ignore it if a number is not finite.
 
-        A command with a number that is not finite is ignored. During a magnetometer calibration, it is only stored.
+        Unless the drone is hovering or flying, and during a magnetometer calibration, the command is only stored.
         """
         if not progress.makes_sense:
             return
@@ -168,12 +152,12 @@ class FlightControl:
         )
 
     def flat_trim(self) -> None:
-        """Handle ``FTRIM``: use the current attitude as level. The request is refused in the air."""
+        """Handle ``FTRIM``: use the current attitude as level. Ignored in the air."""
         if self._vehicle.state is FlightState.LANDED and self._believed is not None:
             self.trim_rad = self._believed.roll_rad, self._believed.pitch_rad
 
     def calibrate(self, device: int, now_ns: int) -> None:
-        """Handle ``CALIB``: turn once on the spot. This is refused on the ground, and always by an AR.Drone 1."""
+        """Handle ``CALIB``: turn once on the spot. Ignored on the ground, and always by an AR.Drone 1."""
         if self._version == 1 or device != 0 or self._vehicle.state not in _FLYING or self.calibrating(now_ns):
             return
         self.calibrations += 1
@@ -182,8 +166,8 @@ class FlightControl:
 
     def animate(self, number: int, duration_ms: int, now_ns: int) -> None:
         """Handle ``ANIM``, or a write to the key ``control:flight_anim``. Ignored unless flying."""
-        if 0 <= number <= LAST_ANIMATION and 0 <= duration_ms <= 60_000 and self._vehicle.state in _FLYING:
-            self.animation = Animation(number, now_ns + duration_ms * 1_000_000)
+        if 0 <= number < len(FLIGHT_ANIMATIONS) and 0 <= duration_ms <= 60_000 and self._vehicle.state in _FLYING:
+            self.animation = number, now_ns + duration_ms * 1_000_000
 
     def calibrating(self, now_ns: int) -> bool:
         """Return whether the drone is turning to calibrate its magnetometer."""
@@ -191,12 +175,12 @@ class FlightControl:
 
     def flipping(self, now_ns: int) -> bool:
         """Return whether a requested flip is still in progress."""
-        return self.animation is not None and self.animation.number >= FIRST_FLIP and now_ns < self.animation.until_ns
+        return self.animation is not None and self.animation[0] >= FIRST_FLIP and now_ns < self.animation[1]
 
     # Supervision -----------------------------------------------------------------------------------------------
 
     def supervise(self, believed: VehicleFeedback, silence_s: float, now_ns: int) -> None:
-        """Check the battery, the angles, and the link (from the time since the last command). Called regularly."""
+        """Check the battery, the angles and, by the time since the last command, the link. Called on every report."""
         self._believed = believed
         self._watch_battery(believed)
         if believed.state is FlightState.EMERGENCY:
@@ -223,7 +207,7 @@ class FlightControl:
         elif not isinstance(self._vehicle.command(ResetEmergency()), Idle):
             self._emergency = State(0)
             self._toggle_ready = False
-        # A reset during the fall is ignored. The reset takes effect on the ground if the emergency bit is still set.
+        # A reset during the fall is ignored; on the ground it takes effect if the emergency bit is still set.
 
     def _watch_battery(self, believed: VehicleFeedback) -> None:
         least_mv = self._configuration.number("general:vbat_min")

@@ -26,8 +26,7 @@ class CommandSequence:
     """Accepts a command only if its number is greater than the last accepted one, or is 1, which restarts the count.
 
     After two seconds without an accepted command, any number greater than 0 is accepted. The Developer Guide says that
-    clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost,
-    so the emulated drone does not insist on it.
+    clients must begin with 1, but a drone that insisted on it would never obey a client whose first datagram was lost.
     """
 
     def __init__(self) -> None:
@@ -62,6 +61,7 @@ _CAMERAS: Final = {
     VideoChannel.FRONT_WITH_BOTTOM: ("front", "bottom"),
     VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
 }
+#: Size of the second camera's image within the first one's [px].
 _INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
 #: Legacy and factory commands, which a real drone accepts and which have no effect here.
 _WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
@@ -85,15 +85,6 @@ class VideoSettings:
         return _INSETS.get(self.channel, (0, 0))
 
 
-@dataclass(frozen=True, slots=True)
-class LedAnimation:
-    """The last requested LED animation, which is only stored: a simulated drone has no lights."""
-
-    number: int
-    frequency_hz: float
-    duration_s: int
-
-
 class ArdroneLogic:
     """The logic of one drone. Not thread-safe."""
 
@@ -102,7 +93,7 @@ class ArdroneLogic:
         self._send_text = send_text
         self._clock = clock
         self._sequence = CommandSequence()
-        self._received_ns = clock()  # time of the last command, or of the start if there was none
+        self._received_ns = clock()  # time of the last accepted command, or of the start
         self._linked = False  # whether a command has arrived since the start or the last link loss
         self._watchdog = True
         self._ack = False
@@ -111,7 +102,7 @@ class ArdroneLogic:
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
         self.bootstrap = True  #: whether the drone sends no options yet, until its mode is configured
-        self.leds: LedAnimation | None = None
+        self.leds: tuple[int, float, int] | None = None  #: number, frequency [Hz] and duration [s] last requested
         self.malformed = 0  #: number of invalid lines, unknown commands and wrong arguments
         self.stale = 0  #: number of commands whose sequence number was not new
         self._handlers: dict[str, Callable[..., None]] = {
@@ -147,18 +138,13 @@ class ArdroneLogic:
             self._execute(command, ids)
 
     def supervise(self, believed: VehicleFeedback) -> None:
-        """Run the watchdogs and check the battery and angles. Called regularly with the vehicle's own estimate."""
-        silence_s = self.silence_s
+        """Run the watchdogs and check battery and angles, given the vehicle's own estimate. Called on every report."""
+        silence_s = seconds(self._clock() - self._received_ns)
         if silence_s > WATCHDOG_S:
             self._watchdog = True
         if silence_s > LOST_AFTER_S and self._linked:
             self._lose_link()
         self.flight.supervise(believed, silence_s, self._clock())
-
-    @property
-    def silence_s(self) -> float:
-        """Time since the last accepted command, or since the start [s]."""
-        return seconds(self._clock() - self._received_ns)
 
     def _lose_link(self) -> None:
         """Reset the link: the next client starts in bootstrap with the default session, user and application."""
@@ -247,7 +233,7 @@ class ArdroneLogic:
         self._send_text(text)
 
     def _led(self, number: int, frequency: int, duration_s: int) -> None:
-        self.leds = LedAnimation(number, to_float(frequency), duration_s)
+        self.leds = number, to_float(frequency), duration_s
 
     def _config_ids(self, session: str, user: str, application: str) -> None:
         self._ids = (str(session).lower(), str(user).lower(), str(application).lower())

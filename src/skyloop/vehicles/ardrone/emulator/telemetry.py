@@ -21,9 +21,9 @@ from skyloop.vehicles.ardrone.wire.configuration import NAVDATA_OPTIONS_USUAL, V
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
 from skyloop.vehicles.emulation.video import NOTHING_SENT, VideoStatus
 
-STANDARD_PRESSURE_PA: Final = 101_325
-PRESSURE_PA_PER_M: Final = 12.0  #: decrease in pressure per metre near the ground, international standard atmosphere
-TEMPERATURE_DECI_C: Final = 250
+STANDARD_PRESSURE_PA: Final = 101_325  #: at the ground: international standard atmosphere at sea level
+PRESSURE_PA_PER_M: Final = 12.0  #: decrease in pressure per metre near the ground, in the same atmosphere
+TEMPERATURE_DECI_C: Final = 250  #: chosen: 25 °C
 FIELD_MG: Final = (200.0, 400.0)  #: horizontal and downward components of the Earth's field at middle latitudes
 LAST_TAG_1: Final = 19  #: highest tag that an AR.Drone 1 sends: VIDEO_STREAM
 

@@ -27,8 +27,8 @@ from skyloop.vehicles.emulation.video import Encoder, Format, Piece
 _NS_PER_US: Final = 1000
 _NS_PER_MS: Final = 1_000_000
 _US_PER_S: Final = 1_000_000
-_SECOND_BITS: Final = 11
-_MICROSECOND_BITS: Final = 21
+_SECOND_BITS: Final = 11  #: upper bits of navdata's time
+_MICROSECOND_BITS: Final = 21  #: lower bits of navdata's time
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class DroneClock:
     booted_ns: int
 
     def navdata_time(self, at_ns: int) -> int:
-        """Return the time with seconds in the upper 11 bits and microseconds in the lower 21; wraps after 2048 s."""
+        """Return the time with seconds in the upper 11 bits and microseconds in the lower 21; it wraps after 2048 s."""
         s, us = divmod((at_ns - self.booted_ns) // _NS_PER_US, _US_PER_S)
         return s % (1 << _SECOND_BITS) << _MICROSECOND_BITS | us
 
@@ -60,7 +60,7 @@ FRONT_2: Final = replace(
     cy=190.144373,
     distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0),
 )
-#: The transmitted image: the middle of the sensor's 320×240 image, enlarged to twice the size.
+#: Model of the transmitted image, the middle of the sensor's 320×240 image at twice the size.
 BOTTOM_2_SENT: Final = replace(
     BOTTOM_CAMERA, width=640, height=360, fx=686.994766, fy=688.195055, cx=329.323208, cy=159.323007
 )

@@ -16,7 +16,7 @@ from typing import Final, TypeAlias
 
 from skyloop.errors import UsageError
 
-PORT: Final = 5556
+PORT: Final = 5556  #: UDP
 MAX_LINE: Final = 1024  #: maximum length of a line [characters]; the drone drops longer ones
 SILENCE_RESET_S: Final = 2.0  #: time without commands after which the drone expects the sequence to restart at 1
 
@@ -28,9 +28,9 @@ AtMessage: TypeAlias = tuple[str, tuple[Argument, ...]]
 class Ref(IntFlag):
     """Bits of ``REF``."""
 
-    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors or, in an emergency, ends the emergency
+    EMERGENCY = 1 << 8  #: each change from 0 to 1 cuts the motors or, in an emergency, ends the emergency
     TAKEOFF = 1 << 9  #: 1: take off and stay in the air; 0: land and stay on the ground
-    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, which the guide requires, although no drone seems to need them
+    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28: the guide requires them, but no drone seems to need them
 
 
 class Pcmd(IntFlag):

@@ -18,7 +18,7 @@ from typing import Final, TypeAlias
 
 from skyloop.errors import DecodeError
 
-PORT: Final = 5559
+PORT: Final = 5559  #: TCP
 END_OF_DUMP: Final = b"\0"
 DEFAULT_ID: Final = "00000000"  #: id of the shared session, user and application
 
@@ -35,7 +35,7 @@ def format_value(value: Value) -> str:
 
 
 def parse_value(text: str, like: Value) -> Value:
-    """Parse a text as a value with the type of ``like``; raise :class:`DecodeError` if the text is not of that type."""
+    """Parse a value of the type of ``like``; raise :class:`DecodeError` if the text does not fit that type."""
     text = text.strip()
     try:
         if isinstance(like, bool):
@@ -130,8 +130,8 @@ class VideoChannel(IntEnum):
 
 
 NAVDATA_OPTIONS_USUAL: Final = 0x10001  #: one bit per tag: DEMO and VISION_DETECT
-NO_CEILING_MM: Final = 100_000
-_INVALID_GPS: Final = 500.0
+NO_CEILING_MM: Final = 100_000  #: value of ``control:altitude_max`` for no ceiling
+_INVALID_GPS: Final = 500.0  #: latitude and longitude while unknown [°]
 
 
 _GENERAL: Final = (
@@ -139,7 +139,7 @@ _GENERAL: Final = (
     Key("general:num_version_mb", 33, read_only=True, text="version of the mother board"),
     Key("general:num_version_soft", "2.3.3", read_only=True, text="version of the firmware"),
     Key("general:drone_serial", "XXXXXXXXXX", read_only=True, text="serial number"),
-    Key("general:soft_build_date", "", read_only=True, text="when the firmware was built"),
+    Key("general:soft_build_date", "", read_only=True, text="build date of the firmware"),
     *(
         Key(f"general:motor{motor}_{what}", "0.0", read_only=True, text=f"{what} version of motor {motor}")
         for motor in (1, 2, 3, 4)
@@ -149,10 +149,10 @@ _GENERAL: Final = (
     Key("general:flying_time", 0, unit="s", read_only=True, text="total time in the air"),
     Key("general:navdata_demo", False, text="send only the options of the demo mode, 15 times a second"),
     Key("general:navdata_options", NAVDATA_OPTIONS_USUAL, Category.APPLICATION, text="options to send: bits by tag"),
-    Key("general:com_watchdog", 2, unit="s", low=0, high=600, text="silence after which the drone lands by itself"),
+    Key("general:com_watchdog", 2, unit="s", low=0, high=600, text="time without commands before the drone lands"),
     Key("general:video_enable", True, text="reserved"),
     Key("general:vision_enable", True, text="reserved"),
-    Key("general:vbat_min", 9000, unit="mV", low=0, high=20000, text="battery at which the drone lands by itself"),
+    Key("general:vbat_min", 9000, unit="mV", low=0, high=20000, text="battery voltage at which the drone lands"),
     Key("general:localtime", 0, unit="s", text="the host's time, for the names of recordings", versions=(2,)),
 )
 
@@ -189,17 +189,17 @@ _CONTROL: Final = (
     Key("control:osctun_value", 63, read_only=True, text="tuning of the oscillator"),
     Key("control:osctun_test", True, read_only=True, text="tuning of the oscillator"),
     Key("control:altitude_max", 3000, unit="mm", low=500, high=NO_CEILING_MM, text="ceiling; 100000 means none"),
-    Key("control:altitude_min", 50, unit="mm", low=50, high=5000, text="least altitude"),
-    Key("control:outdoor", False, text="use the limits for outdoors"),
+    Key("control:altitude_min", 50, unit="mm", low=50, high=5000, text="minimum altitude"),
+    Key("control:outdoor", False, text="use the outdoor limits"),
     Key("control:flight_without_shell", False, text="the outdoor hull is on"),
     Key("control:autonomous_flight", False, text="reserved"),
     Key("control:flight_anim", "0,0", text="flight animation: number, duration [ms]"),
     Key("control:control_level", 0, Category.APPLICATION, low=0, high=3, text="bit 1: combined yaw"),
-    _tilt("euler_angle_max", 12, 0.52, "greatest tilt"),
-    _tilt("control_iphone_tilt", 20, 1.0, "of the phone"),
-    _climb("control_vz_max", 700.0, "greatest climb"),
-    _yaw_rate("control_yaw", 100, "greatest yaw rate"),
-    Key("control:manual_trim", False, Category.USER, text="trim by hand"),
+    _tilt("euler_angle_max", 12, 0.52, "maximum tilt"),
+    _tilt("control_iphone_tilt", 20, 1.0, "maximum tilt of the phone"),
+    _climb("control_vz_max", 700.0, "maximum climb and descent"),
+    _yaw_rate("control_yaw", 100, "maximum yaw rate"),
+    Key("control:manual_trim", False, Category.USER, text="manual trim"),
     _tilt("indoor_euler_angle_max", 12, 0.52, "indoors"),
     _climb("indoor_control_vz_max", 700.0, "indoors"),
     _yaw_rate("indoor_control_yaw", 100, "indoors"),
@@ -207,9 +207,9 @@ _CONTROL: Final = (
     _climb("outdoor_control_vz_max", 1000.0, "outdoors"),
     _yaw_rate("outdoor_control_yaw", 200, "outdoors"),
     Key("control:flying_mode", 0, Category.SESSION, choices=(0, 1, 2, 3), text="0 free, 1 over a roundel, 2 oriented"),
-    Key("control:hovering_range", 1000, Category.SESSION, unit="mm", low=0, high=20000, text="of hover over a roundel"),
+    Key("control:hovering_range", 1000, Category.SESSION, unit="mm", low=0, high=20000, text="range over a roundel"),
     Key("control:shield_enable", False, text="the indoor hull is on", versions=(1,)),
-    Key("control:brushless", True, read_only=True, text="kind of motors", versions=(1,)),
+    Key("control:brushless", True, read_only=True, text="whether the motors are brushless", versions=(1,)),
     Key("control:control_trim_z", 0.0, Category.USER, unit="rad/s", text="trim of the yaw", versions=(1,)),
 )
 _NETWORK: Final = (
@@ -226,15 +226,15 @@ _NETWORK: Final = (
     Key("network:passkey", "", read_only=True, versions=(1,)),
 )
 _VIDEO: Final = (
-    Key("video:camif_fps", 30, unit="1/s", read_only=True, text="pictures a second of the sensor"),
+    Key("video:camif_fps", 30, unit="1/s", read_only=True, text="frame rate of the sensor"),
     Key("video:camif_buffers", 2, read_only=True),
-    Key("video:num_trackers", 12, read_only=True, text="points tracked by the vision"),
+    Key("video:num_trackers", 12, read_only=True, text="number of points tracked by vision"),
     Key("video:video_on_usb", True, text="record to a USB stick if present", versions=(2,)),
     Key("video:video_file_index", 1, text="number of the next recording", versions=(2,)),
-    Key("video:bitrate", 1000, Category.APPLICATION, unit="kbit/s", low=250, high=4000, text="when set by hand"),
-    Key("video:bitrate_ctrl_mode", 0, Category.APPLICATION, choices=(0, 1, 2), text="0 constant, 1 dynamic, 2 by hand"),
-    Key("video:bitrate_storage", 4000, Category.APPLICATION, unit="kbit/s", text="of recordings", versions=(2,)),
-    Key("video:codec_fps", 30, Category.SESSION, unit="1/s", low=15, high=30, text="pictures a second", versions=(2,)),
+    Key("video:bitrate", 1000, Category.APPLICATION, unit="kbit/s", low=250, high=4000, text="bit rate in manual mode"),
+    Key("video:bitrate_ctrl_mode", 0, Category.APPLICATION, choices=(0, 1, 2), text="0 constant, 1 dynamic, 2 manual"),
+    Key("video:bitrate_storage", 4000, Category.APPLICATION, unit="kbit/s", text="recording bit rate", versions=(2,)),
+    Key("video:codec_fps", 30, Category.SESSION, unit="1/s", low=15, high=30, text="frame rate", versions=(2,)),
     Key("video:video_codec", VideoCodec.H264_360P.value, Category.SESSION, text="see VideoCodec"),
     Key("video:video_slices", 0, Category.SESSION, versions=(2,)),
     Key("video:video_live_socket", 0, Category.SESSION, versions=(2,)),
@@ -243,13 +243,13 @@ _VIDEO: Final = (
 )
 _OTHERS: Final = (
     Key("leds:leds_anim", "0,0,0", text="animation: number, frequency [bits of a float, Hz], duration [s]"),
-    Key("detect:enemy_colors", 1, choices=(1, 2, 3), text="of the indoor stickers: 1 green, 2 yellow, 3 blue"),
+    Key("detect:enemy_colors", 1, choices=(1, 2, 3), text="indoor stickers: 1 green, 2 yellow, 3 blue"),
     Key("detect:enemy_without_shell", 0, text="look for the outdoor stickers"),
     Key("detect:groundstripe_colors", 16, Category.SESSION),
-    Key("detect:detect_type", 3, Category.SESSION, choices=tuple(range(15)), text="2 by vision, 3 nothing, 10 several"),
-    Key("detect:detections_select_h", 0, Category.SESSION, text="tags looked for with the front camera: bits"),
-    Key("detect:detections_select_v_hsync", 0, Category.SESSION, text="with the bottom camera, at its full rate: bits"),
-    Key("detect:detections_select_v", 0, Category.SESSION, text="with the bottom camera: bits"),
+    Key("detect:detect_type", 3, Category.SESSION, choices=tuple(range(15)), text="2 vision, 3 nothing, 10 several"),
+    Key("detect:detections_select_h", 0, Category.SESSION, text="tags for the front camera: bits"),
+    Key("detect:detections_select_v_hsync", 0, Category.SESSION, text="tags for the bottom camera, at full rate: bits"),
+    Key("detect:detections_select_v", 0, Category.SESSION, text="tags for the bottom camera: bits"),
     Key("syslog:output", 7),
     Key("syslog:max_size", 102400),
     Key("syslog:nb_files", 5),
@@ -322,4 +322,4 @@ FLIGHT_ANIMATIONS: Final = (
     ("flip_right", 15),
 )
 NO_ANIMATION: Final = "none"
-FIRST_FLIP: Final = 16
+FIRST_FLIP: Final = 16  #: index of the first flip in ``FLIGHT_ANIMATIONS``; an AR.Drone 1 has no flips

@@ -20,9 +20,9 @@ from typing import Any, Final, NamedTuple, TypeAlias, TypeVar, cast
 from skyloop.errors import DecodeError
 from skyloop.vehicles.ardrone.wire import at, configuration
 
-PORT: Final = 5554
+PORT: Final = 5554  #: UDP
 SIGNATURE: Final = 0x55667788
-MAX_DATAGRAM: Final = 4096
+MAX_DATAGRAM: Final = 4096  #: bytes; a datagram with all known options is shorter
 FIRST_SEQUENCE: Final = 1
 
 _HEADER: Final = struct.Struct("<4I")
@@ -189,7 +189,7 @@ class Time(NamedTuple):
 
 @_option(2, "3H 3h 2h I H H H H H H H H H I i h")
 class RawMeasures(NamedTuple):
-    """The analogue-to-digital converters' readings; ``vbat_raw`` is in mV."""
+    """The analogue-to-digital converters' readings; ``vbat`` is in mV."""
 
     accs: Ints = (0,) * 3
     gyros: Ints = (0,) * 3
@@ -399,12 +399,12 @@ def _decode_options(datagram: bytes | memoryview, end: int) -> tuple[dict[type[O
     return options, unknown
 
 
-VIDEO: Final = 5555
+VIDEO: Final = 5555  #: the video's port
 
 
 @dataclass(frozen=True, slots=True)
 class Ports:
-    """The drone's ports; where a port can be chosen, 0 means any free one."""
+    """The drone's ports; for an emulated drone, 0 means any free port."""
 
     navdata: int = PORT  #: UDP
     video: int = VIDEO  #: UDP on an AR.Drone 1, TCP on an AR.Drone 2
@@ -413,7 +413,7 @@ class Ports:
 
     @classmethod
     def free(cls) -> Ports:
-        """Return ports that are all 0, which stands for any free ones."""
+        """Return 0 for each port, which means any free port."""
         return cls(0, 0, 0, 0)
 
 

@@ -15,16 +15,16 @@ from typing import Final
 from skyloop.errors import UsageError
 
 SIGNATURE: Final = b"PaVE"
-MIN_HEADER: Final = 64
-MAX_HEADER: Final = 128
-MAX_SIDE: Final = 4096
+MIN_HEADER: Final = 64  #: size of the shortest header [bytes]
+MAX_HEADER: Final = 128  #: size of the longest plausible header [bytes]
+MAX_SIDE: Final = 4096  #: longest plausible side of an image [px]
 DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: size in bytes; the drone's 720p key frames are smaller than 100 kB
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and including advertised_size, 52 bytes
-_ADVERTISEMENT: Final = 1
+_ADVERTISEMENT: Final = 1  #: control flag of a header without a payload
 _RESERVED: Final = struct.Struct("<I3f")  # last 16 bytes of a long header; the last 12 of a short one are zeros
-_VERSION: Final = 2
-_MACROBLOCK: Final = 16
+_VERSION: Final = 2  #: version of the format
+_MACROBLOCK: Final = 16  #: side of a macroblock [px]
 
 
 class Codec(IntEnum):
@@ -150,7 +150,7 @@ class PaveParser:
         return frames
 
     def end(self) -> None:
-        """Handle the end of the stream: the remaining bytes cannot become a complete frame."""
+        """Handle the end of the stream: drop the bytes of an incomplete frame."""
         if self._header is not None:
             self.broken_frames += 1
         self._skip(len(self._buffer))
@@ -209,7 +209,7 @@ class PaveParser:
 
 
 def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None:
-    """Return the header at a position followed by at least MIN_HEADER bytes; None if it is not valid."""
+    """Return the header at a position, from which at least MIN_HEADER bytes remain; None if it is not valid."""
     fields = _HEADER.unpack_from(buffer, at)
     _, version, codec, size, payload_size, encoded_width, encoded_height, width, height, number, timestamp_ms = fields[
         :11

@@ -62,28 +62,29 @@ from skyloop.errors import DecodeError
 
 # Constants and tables, for the emulator's encoder as well ------------------------------------------------------------
 
-START_CODE_BITS: Final = 22
+START_CODE_BITS: Final = 22  #: width of a start code
 UVLC_START: Final = 0x20  #: start code of a picture and of its group 0; add k for group k
 P264_START: Final = 0x40  #: start code of the drone's other codec
 END_OF_PICTURE: Final = 0x3F  #: code that marks the end where group 31 would start
-MAX_GROUPS: Final = 31
+MAX_GROUPS: Final = 31  #: groups that start codes can number
 
+# Widths of a header's fields, and of a block's mean.
 FORMAT_BITS: Final = 2
 RESOLUTION_BITS: Final = 3
 TYPE_BITS: Final = 3
 QUANT_BITS: Final = 5
 NUMBER_BITS: Final = 32
+DC_BITS: Final = 10
 
 MACROBLOCK: Final = 16  #: side of a macroblock, and height of a group [px]
 BLOCKS: Final = 6  #: blocks per macroblock: four for luma in reading order, then Cb and Cr at half resolution
 SIDE: Final = 8  #: side of a block [px]
 COEFFICIENTS: Final = SIDE * SIDE
-DC_BITS: Final = 10
 
-FINEST_QUANT: Final = 1
-COARSEST_QUANT: Final = 30
+FINEST_QUANT: Final = 1  #: lowest quantiser
+COARSEST_QUANT: Final = 30  #: highest quantiser
 TABLE_QUANT: Final = 31  #: not a step size but a mode that uses the steps of ``TABLE_QUALITY``; real drones send it
-TABLE_QUALITY: Final = 2
+TABLE_QUALITY: Final = 2  #: quantiser with the steps of ``TABLE_QUANT``
 DQUANT: Final = (-1, -2, 1, 2)  #: quantiser changes, indexed by their two-bit code
 
 MAX_RUN_ZEROS: Final = 6  #: number of leading zeros in the longest code for a run
@@ -338,8 +339,8 @@ class UvlcDecoder:
     def decode(self, packet: bytes | bytearray | memoryview) -> UvlcPicture:
         """Return the picture in a datagram.
 
-        Raises DecodeError for anything but one complete picture (truncated or damaged data, another codec
-        (:func:`is_p264`), or changes to a picture other than the previous one). It is then ready for the next picture.
+        Raises DecodeError for anything but one complete picture: truncated or damaged data, another codec
+        (:func:`is_p264`), or changes to a picture other than the previous one. It can then decode the next picture.
         """
         reader = _Reader(bytes(packet))
         header = reader.read_header()

@@ -92,7 +92,7 @@ class RunningFirmware(RunningEmulator):
         self.autopilot.crashed(text)
 
 
-BOOT_S: Final = 2.0
+BOOT_S: Final = 2.0  #: chosen; real vehicles take 5 to 40 s
 
 
 class MavlinkFirmware(Emulator[RunningFirmware]):
@@ -109,7 +109,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         system: MAVLink system id, 1 to 255; None for the drone's number plus one.
         faults: Faults injected into UDP datagrams in both directions.
         delay_s: Delay added to UDP datagrams in each direction.
-        boot_s: Simulated time from the start until the vehicle can be armed, in seconds (real vehicles take 5 to 40).
+        boot_s: Simulated time from the start until the vehicle can be armed, in seconds.
         gps: Whether the vehicle has GPS; without it, the autopilot is not ready until external poses arrive.
         version: 1 if the autopilot supports only MAVLink 1.
         key: 32-byte key for signing all messages; None to sign nothing.
@@ -153,7 +153,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
-        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports reserved for a restart
+        self.settings = replace(self.settings, ports=running.ports)  # keeps the ports the same after a restart
         return running
 
     @property

@@ -37,8 +37,8 @@ TURN_RAD_S: Final = math.radians(60)  #: maximum turn rate of CONDITION_YAW
 RTL_LOWEST_M: Final = 0.3  #: lowest altitude above home for a return
 RTL_LEAST_SLOPE: Final = 0.5  #: flatter RTL cones are ignored
 _GUIDED_ITEM: Final = 2  #: value of "current" in a mission item that means "fly there now"
-_ALTITUDE_ITEM: Final = 3
-CHANNELS: Final = 16
+_ALTITUDE_ITEM: Final = 3  #: and the value that means "change the altitude now"
+CHANNELS: Final = 16  #: number of channels reported
 _OVERRIDDEN: Final = 8  #: number of channels that an override can set
 _IGNORED: Final = 0xFFFF  #: value for a channel that an override leaves unchanged
 _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
@@ -56,7 +56,7 @@ class ArduCopter(Autopilot):
     ABOVE_SEA = frozenset({0, 5})
     ABOVE_HOME = frozenset({3, 6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_SET_HOME: 0}
-    NOTHING_TO_TELL = Result.FAILED
+    NOT_PROVIDED = Result.FAILED
     BYTEWISE = False
     DISARM_S = 10.2
     WORDS: ClassVar[dict[str, str]] = {
@@ -262,7 +262,7 @@ class ArduCopter(Autopilot):
         return target if all(map(math.isfinite, numbers)) else None
 
     def _from_here(self, message: Message) -> Target:
-        """Return a target whose position is relative to the vehicle; this is the case in all frames but one."""
+        """Return the target with its position made absolute: in all frames but one, it is relative to the vehicle."""
         target = target_of(message)
         if target.place is None or message.coordinate_frame == WORLD:
             return target

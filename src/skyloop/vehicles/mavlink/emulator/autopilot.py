@@ -22,7 +22,8 @@ from skyloop.vehicles.mavlink.wire.axes import Vector
 from skyloop.vehicles.mavlink.wire.codec import Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-FORCE: Final = 21196  #: parameter of the disarm command that means "even in flight"
+FORCE: Final = 21196  #: argument of the disarm command that means "even in flight"
+# MAV_SEVERITY.
 WARNING: Final = 4
 CRITICAL: Final = 2
 INFO: Final = 6
@@ -62,7 +63,7 @@ class Autopilot(AutopilotState):
     ABOVE_SEA: ClassVar[frozenset[int]]  #: frames of global positions with altitudes above mean sea level
     ABOVE_HOME: ClassVar[frozenset[int]]  #: frames of global positions with altitudes above home
     LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of the position in COMMAND_LONG, for each command that accepts one
-    NOTHING_TO_TELL: ClassVar[int]  #: result of a request for a message that it does not provide
+    NOT_PROVIDED: ClassVar[int]  #: result of a request for a message that it does not provide
     BYTEWISE: ClassVar[bool]
     DISARM_S: ClassVar[float]  #: time after which a vehicle armed on the ground disarms
     WORDS: ClassVar[dict[str, str]]  #: texts for the events armed, disarmed, auto_disarm (on the ground) and landed
@@ -250,10 +251,10 @@ class Autopilot(AutopilotState):
         elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
             answer = self._requested(asked)
-            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOT_PROVIDED
         elif number == m.MAV_CMD_GET_HOME_POSITION:
             answer = self._requested(m.MAVLINK_MSG_ID_HOME_POSITION)
-            result = Result.ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+            result = Result.ACCEPTED if answer is not None else self.NOT_PROVIDED
         elif number in self._placed_commands:
             result = Result.UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
         else:

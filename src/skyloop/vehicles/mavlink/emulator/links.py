@@ -160,7 +160,7 @@ class Streams:
 
 OnMessage = Callable[["Port", Message], None]
 
-AUTOPILOT_COMPONENT: Final = 1
+AUTOPILOT_COMPONENT: Final = 1  #: MAV_COMP_ID_AUTOPILOT1
 PEER_NS: Final = nanoseconds(3.0)  #: time without data after which a peer may be replaced by another
 
 

@@ -17,6 +17,7 @@ from skyloop.vehicles.emulation.flight import USUAL, YAW_GAIN_PER_S, FlightContr
 from skyloop.vehicles.mavlink.wire.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Message
 
+#: PX4's usual place for simulations, near Zurich, on a sphere with 111,320 m per degree.
 ORIGIN: Final = EarthOrigin(47.397742, 8.545594, 488.0, math.degrees(111_320.0))
 
 
@@ -27,7 +28,7 @@ def geodetic(place: Vector) -> tuple[int, int, int]:
 
 
 def place_of(latitude_deg: float, longitude_deg: float, up: float) -> Vector:
-    """Return the east, north, up coordinates of a latitude and longitude at a height above the origin [m]."""
+    """Return the coordinates east, north, up [m] of a latitude and longitude at a height above the origin [m]."""
     return ORIGIN.position_of(latitude_deg, longitude_deg, ORIGIN.altitude_m + up)
 
 
@@ -36,10 +37,12 @@ def on_earth(latitude_deg: float, longitude_deg: float) -> bool:
     return abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0
 
 
-WORLD: Final = 1  #: MAV_FRAME_LOCAL_NED
+# MAV_FRAME: local north, east, down, or levelled body axes, from the origin or from the vehicle.
+WORLD: Final = 1
 WORLD_OFFSET: Final = 7
 BODY: Final = 8
 BODY_OFFSET: Final = 9
+# Bits of a type mask (POSITION_TARGET_TYPEMASK, then ATTITUDE_TARGET_TYPEMASK): fields to ignore.
 _POSITION: Final = 0x007
 _VELOCITY: Final = 0x038
 _YAW: Final = 0x400
@@ -163,13 +166,13 @@ class Turn:
     """A turn by an angle from the present heading [rad]: positive counter-clockwise, may exceed half a turn."""
 
     def __init__(self, flight: FlightControl, angle: float, fastest: float) -> None:
-        self._flyer, self._fastest = flight, fastest
+        self._flight, self._fastest = flight, fastest
         self._left, self._yaw = angle, flight.yaw
 
     def rate(self) -> float:
         """Return the present yaw rate [rad/s]. Called on every tick."""
-        self._left -= wrap_angle(self._flyer.yaw - self._yaw)
-        self._yaw = self._flyer.yaw
+        self._left -= wrap_angle(self._flight.yaw - self._yaw)
+        self._yaw = self._flight.yaw
         return clamped(YAW_GAIN_PER_S * self._left, self._fastest)
 
 
@@ -177,7 +180,7 @@ class Manoeuvres:
     """The manoeuvres of one flight. Heights are above the flight's origin [m]."""
 
     def __init__(self, flight: FlightControl) -> None:
-        self._flyer = flight
+        self._flight = flight
         self._rise_m: float | None = None
         self._return: _Return | None = None
 
@@ -187,7 +190,7 @@ class Manoeuvres:
 
     def rise(self) -> bool:
         """Take off and climb; return whether the height has been reached. Called on every tick."""
-        flight = self._flyer
+        flight = self._flight
         if self._rise_m is None:
             return True
         if not flight.airborne:
@@ -202,11 +205,11 @@ class Manoeuvres:
 
         ``final_m`` is the height to descend to instead of landing; None to land.
         """
-        self._return = _Return(self._flyer.place, home, min(height_m, self._flyer.highest_m), wait_s, final_m)
+        self._return = _Return(self._flight.place, home, min(height_m, self._flight.highest_m), wait_s, final_m)
 
     def return_home(self, speeds: Speeds = USUAL) -> None:
         """Continue the return. Called on every tick."""
-        flight, way = self._flyer, self._return
+        flight, way = self._flight, self._return
         if way is None or flight.standing:
             return
         east, north, _ = way.home
@@ -236,10 +239,10 @@ class Manoeuvres:
     ) -> None:
         """Follow a set-point (an attitude with ``lean``), or hold position if there is none. Called on every tick."""
         if isinstance(target, Target):
-            target.follow(self._flyer, speeds, turn)
+            target.follow(self._flight, speeds, turn)
         elif target is not None:
             lean(target)
         elif turn is not None:
-            self._flyer.move(0.0, 0.0, 0.0, turn)
+            self._flight.move(0.0, 0.0, 0.0, turn)
         else:
-            self._flyer.hold()
+            self._flight.hold()

@@ -26,7 +26,7 @@ from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
 from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
-SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate if there is no remote control
+SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate in stick modes if there is no remote control
 STICK_SPEED_M_S: Final = 10.0  #: speed at full stick (MPC_VEL_MANUAL)
 STICK_EXPO: Final = 0.6  #: how much a stick's response is flattened near its centre (MPC_XY_MAN_EXPO, MPC_Z_MAN_EXPO)
 STICK_FILTER_S: Final = 0.1  #: time constant of the filter for a stick's speed
@@ -63,7 +63,7 @@ class Px4(Autopilot):
     ABOVE_SEA = frozenset({5})
     ABOVE_HOME = frozenset({6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_REPOSITION: 5, m.MAV_CMD_DO_SET_HOME: 5}
-    NOTHING_TO_TELL = Result.DENIED
+    NOT_PROVIDED = Result.DENIED
     BYTEWISE = True
     DISARM_S = 11.1
     REPORTS_PREARM = False
@@ -329,7 +329,7 @@ class Px4(Autopilot):
             return
         throttle = 2 * message.z - 1000
         ways = (message.x, -message.y, throttle, -message.r)
-        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # larger: no axis
+        forward, left, up, turn = (each / 1000 if abs(each) <= 1000 else 0.0 for each in ways)  # larger: not sent
         stick = (forward, left, up, turn)
         since_s = self.time_s - self._stick_s
         if not self.remote:
@@ -363,7 +363,7 @@ class Px4(Autopilot):
         self.flight.move_body(forward * STICK_SPEED_M_S, left * STICK_SPEED_M_S, up * fastest, yaw_rate)
 
     def _check_sticks(self) -> None:
-        """In any mode, once a remote control in use is lost, hold position and then return."""
+        """Once a remote control in use is lost, in any mode, hold position, then do what NAV_RCL_ACT says."""
         if self.remote:
             if self._lost_stick_s is not None:  # the remote control came back before the return began
                 self.failsafe, self._lost_stick_s = False, None

@@ -19,7 +19,7 @@ MOST_ITEMS: Final = 500  #: maximum number of items in a mission
 _SCALE: Final = 1e7  #: scale of latitude and longitude in MISSION_ITEM_INT
 _HOME_FRAME: Final = 0  #: MAV_FRAME_GLOBAL, with altitudes above mean sea level
 
-# The file protocol's requests and replies.
+# The file protocol's requests, replies and errors (MAVLink FTP).
 _END_SESSION: Final = 1
 _END_SESSIONS: Final = 2
 _NAMING: Final = (3, 4, 6, 8, 9, 10, 11, 12, 13, 14)  #: requests with a file name: list, open, create, remove, ...
@@ -31,6 +31,7 @@ _INVALID_SESSION: Final = 4
 _END_OF_FILE: Final = 6
 _UNKNOWN_COMMAND: Final = 7
 _FILE_NOT_FOUND: Final = 10
+# Offsets of a payload's fields, and its size [bytes].
 _SEQUENCE: Final = slice(0, 2)
 _SESSION: Final = 2
 _OPCODE: Final = 3
@@ -167,6 +168,7 @@ def _error(opcode: int) -> int:
 
 
 AT_ONCE: Final = 16  #: number of listed parameters sent with each report
+# MAV_PARAM_TYPE.
 INT8: Final = 2
 INT16: Final = 4
 INT32: Final = 6

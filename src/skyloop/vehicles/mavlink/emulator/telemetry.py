@@ -17,8 +17,9 @@ from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message, ModeFlag, SystemState
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
+# Bits of MAV_SYS_STATUS_SENSOR.
 PREARM: Final = 0x10000000
-REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+REMOTE: Final = 0x10000
 _SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
 _BATTERY: Final = 0x2000000
 #: Estimator flags for a known position: relative and absolute, each current and predicted for flight. DroneKit waits
@@ -26,7 +27,7 @@ _BATTERY: Final = 0x2000000
 _PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
 POSES_S: Final = 1.0  #: how long external poses must arrive before the position is known without GPS
 POSE_GAP_S: Final = 0.5  #: time without external poses after which the position is lost
-_COPIES: Final = 1 << 32
+_WRAP_MS: Final = 1 << 32  #: stamps wrap around at this value
 _LANDED: Final = {
     FlightState.LANDED: Landed.ON_GROUND,
     FlightState.EMERGENCY: Landed.ON_GROUND,
@@ -61,7 +62,7 @@ class AutopilotState(ABC):
     @property
     def boot_ms(self) -> int:
         """Time since power-on, as in 32-bit message fields [ms]."""
-        return round(self.time_s * 1000) % _COPIES
+        return round(self.time_s * 1000) % _WRAP_MS
 
     @property
     def boot_ns(self) -> int:
@@ -117,7 +118,7 @@ class AutopilotState(ABC):
         return None
 
 
-_MOST_CHANNELS: Final = 18
+_MOST_CHANNELS: Final = 18  #: number of channel fields in RC_CHANNELS
 Maker = Callable[[AutopilotState], Message | None]
 
 

@@ -51,8 +51,8 @@ def from_wire(q: Sequence[float]) -> Quaternion:
     return x, y, z, w
 
 
-def turned_axes(q: Sequence[float]) -> Quaternion:
-    """Convert a body-to-world rotation (w, x, y, z) between our axes and MAVLink's, up to its sign."""
+def turned_axes(q: Sequence[float]) -> tuple[float, float, float, float]:
+    """Convert a body-to-world rotation (w, x, y, z) between our axes and MAVLink's, up to the quaternion's sign."""
     w, x, y, z = q
     return _HALF * (w + z), _HALF * (x + y), _HALF * (x - y), _HALF * (w - z)
 

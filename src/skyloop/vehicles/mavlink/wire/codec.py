@@ -30,17 +30,17 @@ __all__ = ["KEY_BYTES", "MAX_FRAME", "Codec", "Message", "dialect"]
 Message: TypeAlias = Any
 
 MAX_FRAME: Final = 280  #: size of the longest frame in bytes, including the signature
-KEY_BYTES: Final = 32
+KEY_BYTES: Final = 32  #: size of a signing key
 _AROUND_V1: Final = 8  #: bytes in a MAVLink 1 frame's header and checksum
 _AROUND_V2: Final = 12  #: bytes in a MAVLink 2 frame's header and checksum
-_SIGNATURE: Final = 13  #: bytes in a signature
-_LEAST: Final = _AROUND_V1
+_SIGNATURE: Final = 13  #: bytes in a signature: link id (1), time (6), hash (6)
+_LEAST: Final = _AROUND_V1  #: bytes in the shortest frame
 _MARKERS: Final = (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2)
 _MOST_SOURCES: Final = 16  #: maximum number of senders whose incomplete frames are kept: anybody can send datagrams
 _SIGNED: Final = 1  #: incompatibility flag that marks a signed frame
-_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, from which signature time counts in steps of 10 µs
-_STEPS_PER_S: Final = 100_000
-_OLD: Final = 60 * _STEPS_PER_S  #: how far a new sender's timestamp may lag behind
+_SIGNING_EPOCH_S: Final = 1_420_070_400  #: 2015-01-01, the start of signature time
+_STEPS_PER_S: Final = 100_000  #: signature time counts in steps of 10 µs
+_OLD: Final = 60 * _STEPS_PER_S  #: how far a new sender's time may lag behind
 _UNSIGNED: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS  #: accepted without a signature: radios have no key
 _HEADER_V1: Final = struct.Struct("<xBBBBB")  #: length, sequence number, system, component, type
 _HEADER_V2: Final = struct.Struct("<xBBBBBBHB")  #: length, two flag bytes, then as above but with a three-byte type
@@ -156,7 +156,7 @@ class _Signatures:
 class Codec:
     """One end of a link, with its sequence numbers, incomplete frames and signatures.
 
-    With a 32-byte ``key``, everything sent is signed and everything unsigned is rejected (MAVLink 2 only).
+    With a 32-byte ``key``, everything sent is signed, and everything unsigned but RADIO_STATUS rejected (MAVLink 2).
     """
 
     def __init__(self, system: int, component: int, *, key: bytes | None = None) -> None:
@@ -258,7 +258,7 @@ _MOST_OPEN: Final = 8  #: maximum number of unfinished texts; beyond that, the o
 
 
 def chunks_of(text: str, severity: int, number: int) -> list[Message]:
-    """Split a text into messages. ``number`` is the text's id, or 0 if the text fits in a single message."""
+    """Split text into messages. ``number`` is the text's id, or 0 if it fits in a single message."""
     data = text.encode("ascii", "replace")
     if len(data) < CHUNK:
         return [dialect.MAVLink_statustext_message(severity, data, 0, 0)]
@@ -310,7 +310,7 @@ def _printable(text: str) -> str:
 
 
 BYTEWISE: Final = 0x10  #: the capabilities' bit for bytewise encoding of integers
-REAL32: Final = 9
+REAL32: Final = 9  #: MAV_PARAM_TYPE
 #: For each integer ``MAV_PARAM_TYPE``: the layout in the four bytes, and the range.
 _INTEGERS: Final = {
     1: ("<B3x", 0, 0xFF),

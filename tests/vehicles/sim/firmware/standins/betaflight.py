@@ -1,8 +1,8 @@
-"""Stands in for Betaflight's program: its command line, its motors and its state, without anything that flies.
+"""Stand-in for Betaflight's program: its command line, its motors and its state, without flight.
 
 STANDIN_PORTS in the environment: its ports for motors, state and MSP. Its motors are those of the other stand-ins.
-STANDIN_DEAF, STANDIN_HANGS: a folder. A start that finds a file in it removes one, and listens without ever answering,
-or answers while its flight control never runs.
+STANDIN_DEAF, STANDIN_HANGS: a folder. A start that finds a file in it removes one, and then never answers, or answers
+although its flight control never runs.
 """
 
 import os
