@@ -67,7 +67,6 @@ class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
-        """Initialise the control law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
@@ -145,7 +144,6 @@ class FollowLaw(VelocityLaw):
         if self._face is None or float(np.hypot(*self._face)) < 0.3:  # facing up or down, or estimates cancel out
             self.aside_rad = None
             return 0.0
-        # Compute the angle from the vehicle's direction to the marker's normal, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)

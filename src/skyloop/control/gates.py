@@ -139,7 +139,7 @@ class FlyThroughGates(Behaviour):
             drone: The drone to fly.
             gates: The gates in order, or a course with a map.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: :class:`CourseSettings` with a map, otherwise :class:`GateSettings`; None for the defaults.
+            settings: :class:`CourseSettings` for a course, :class:`GateSettings` for gates; None for the defaults.
 
         Raises:
             UsageError: There are no gates, a colour has no hue, or the settings are for the other control law.
@@ -179,7 +179,7 @@ class FlyThroughGates(Behaviour):
         return self._gates[self.passed] if self.passed < len(self._gates) else None
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the nearest gate of the next colour and update the law."""
+        """Detect the next gate and any poles on the map, update the law, and end the behaviour if the law is stuck."""
         if self.phase is GatePhase.PASSED:
             self._next()
         gate = self.gate
@@ -195,16 +195,14 @@ class FlyThroughGates(Behaviour):
                 frame.captured_ns,
                 trust=1.0 - nearest.ambiguity,
             )
-        if isinstance(self._gate_law, CourseLaw):
-            self._look_for_poles(self._gate_law, frame)
+        law = self._gate_law
+        if isinstance(law, CourseLaw):
+            if self._poles is not None and frame.feedback is not None:
+                for pole in self._poles.detect(frame):
+                    law.see_pole(pole.ray_in_body(self._mounting), frame.feedback, frame.captured_ns)
+            if law.stuck is not None and not self.done:
+                self.finish(law.stuck, Severity.WARNING)
         return self._drawing(gate, seen)
-
-    def _look_for_poles(self, law: CourseLaw, frame: Frame) -> None:
-        if self._poles is not None and frame.feedback is not None:
-            for pole in self._poles.detect(frame):
-                law.see_pole(pole.ray_in_body(self._mounting), frame.feedback, frame.captured_ns)
-        if law.stuck is not None and not self.done:
-            self.finish(law.stuck, Severity.WARNING)
 
     def _next(self) -> None:
         before = self._gates[self.passed]

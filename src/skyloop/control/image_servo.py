@@ -29,7 +29,7 @@ from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
-from skyloop.messages.geometry import rotation_from_euler, wrap_angle
+from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision import MarkerDetector
@@ -314,7 +314,6 @@ class FlowLaw(AirframeLaw):
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
-        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING  #: phase at the last step
@@ -330,7 +329,7 @@ class FlowLaw(AirframeLaw):
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position at a capture time, (2,) [m], along yaw 0 and to the left of it.
+        """Update with the vehicle's position when a frame was captured, (2,) [m], along yaw 0 and to the left of it.
 
         The first position becomes the position to hold, as does the first one after a gap of more than a second.
         """
@@ -362,8 +361,7 @@ class FlowLaw(AirframeLaw):
         asked = self._loop.step(off, min(0.2, self._since_s(now_ns))) - s.damping * ahead.velocity
         wanted = shortened(asked, s.tilt_rad * GRAVITY_M_S2)
         self._loop.applied(asked, wanted)
-        c, si = math.cos(yaw), math.sin(yaw)
-        forward, left = c * wanted[0] + si * wanted[1], c * wanted[1] - si * wanted[0]
+        forward, left = turned(float(wanted[0]), float(wanted[1]), -yaw)
         return Attitude(
             roll=-math.atan2(left, GRAVITY_M_S2),
             pitch=math.atan2(forward, GRAVITY_M_S2),
@@ -420,7 +418,7 @@ class FlowHover(Behaviour):
             let_go(self.drone, "the ground is out of view")
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Track the ground."""
+        """Track the ground, update the control law and draw the tracked corners."""
         found = None if frame.feedback is None else self._tracker.see(frame, frame.feedback)
         if found is None:
             return [Text(self.phase.value, (8.0, 16.0), _LOST)]

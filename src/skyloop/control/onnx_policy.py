@@ -65,7 +65,8 @@ class PolicyNetwork:
     Attributes:
         camera: Name of the camera whose images the network was trained on.
         size: Width and height of input images [px]; other images are scaled.
-        state: Names of the state values. action: ``velocity`` or ``attitude``.
+        state: Names of the state values.
+        action: ``velocity`` or ``attitude``.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.
@@ -230,9 +231,9 @@ class OnnxPolicy(Behaviour):
     """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
     The proxy's limits, zones and failsafe apply as they do for any application. The vehicle hovers, and an event
-    reports why, if no frames arrive, if a state value that the network needs is missing or half a second old, or if the
-    action is not finite. In each case the network's memory is cleared. The vehicle must be airborne when :meth:`run` is
-    called. All callbacks run on the thread that called :meth:`run`.
+    reports why, if no frames arrive, if a state value that the network needs is missing or over half a second old, or
+    if the action is not finite. In each case the network's memory is cleared. The vehicle must be airborne when
+    :meth:`run` is called. All callbacks run on the thread that called :meth:`run`.
     """
 
     name = "policy"

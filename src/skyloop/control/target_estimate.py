@@ -32,8 +32,8 @@ from skyloop.poses import mounting_rotation
 from skyloop.vision.lens import project, unproject
 from skyloop.vision.tracking import Box
 
-_CUT_PX: Final = 2.0  # distance to the image's edge within which a box may be cut off [px] ...
-_CUT: Final = 0.07
+_CUT_PX: Final = 2.0  # distance to the image's edge within which a box may be cut off [px], ...
+_CUT: Final = 0.07  # ... or this fraction of the box's height if that is more
 _BESIDE: Final = 0.75  # maximum distance from the optical axis as a fraction of the image size; 0.5 is the edge
 _STEEPEST: Final = 0.15  # minimum cosine of the elevation: objects almost straight above or below have no azimuth
 _TILT_RAD: Final = 0.008  # error of roll and pitch at the time of capture, which shifts both edges equally

@@ -28,7 +28,7 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, 
 _SAME: Final = 0.4  # minimum overlap of two boxes that show the same object
 _POINTED_AT: Final = 0.3  # minimum overlap between the user's box and the detection that it selects
 _TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are sharper
-_BESIDE_LATE: Final = 0.25  # tracker noise when late detections provide the size, because the tracker's size drifts
+_TRACKER_NOISE_LATE: Final = 0.25  # the same while late detections provide the size, because the tracker's size drifts
 _TAKEN: Final = 0.5  # if this fraction of the tracker's box is inside another object's box, it contains that object
 _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
 _DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
@@ -107,9 +107,10 @@ class TargetFinder:
     def see(
         self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
     ) -> Sighting:
-        """Find the target in the next image; ``detections`` is None if no detector searched it.
+        """Find the target in the next image.
 
-        ``ground`` states whether the camera's height above the ground is known.
+        ``ground`` states whether the camera's height above the ground is known. ``detections`` is None if no detector
+        has searched the image.
         """
         self._frames.append(_Seen(image, camera, captured_ns))
         self._ground = ground
@@ -144,7 +145,7 @@ class TargetFinder:
         self._ground = ground
         self._use(detections, frame, TrackResult(frame.box, 0.0), ground=ground)
         target = self.target
-        self._tracker_noise = _TRACKER_NOISE if target is None else _BESIDE_LATE
+        self._tracker_noise = _TRACKER_NOISE if target is None else _TRACKER_NOISE_LATE
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:

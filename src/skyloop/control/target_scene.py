@@ -167,9 +167,10 @@ class Scene:
     def update(
         self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections in the next image; ``ground``: whether the camera's height above ground is known.
+        """Match the detections in the next image.
 
-        ``looks`` contains the colours for each detection: (6,), or (n, 6) for n strips from left to right.
+        ``looks`` contains the colours of each detection: (6,), or (n, 6) for n strips from left to right. ``ground``
+        states whether the camera's height above the ground is known.
         """
         self._forget(at_ns)
         seen = [

@@ -44,7 +44,7 @@ class Waypoint:
 
     @property
     def position(self) -> Vector:
-        """Return (x, y, z) [m], world axes."""
+        """The position (x, y, z) in world axes [m]."""
         return self.x, self.y, self.z
 
 
@@ -82,10 +82,10 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
     speed = _approach(away, s.speed_m_s, s)
     share = speed / away if away > 1e-9 else 0.0
     assert feedback.yaw_rad is not None
-    c, si = math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad)
+    forward, left = turned(east, north, -feedback.yaw_rad)
     return Velocity(
-        forward=share * (c * east + si * north),
-        left=share * (c * north - si * east),
+        forward=share * forward,
+        left=share * left,
         up=math.copysign(_approach(abs(up), s.climb_m_s, s), up),
         yaw_rate=clamped(s.yaw_gain * yaw, s.turn_rad_s),
     )
@@ -101,7 +101,7 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 
 
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
-    """Return the difference between the vehicle and the goal: east, north, up [m] and yaw [rad]."""
+    """Return the goal's pose minus the vehicle's: east, north, up [m] and yaw [rad]."""
     problem = lacking(feedback)
     if problem or feedback.position_m is None or feedback.yaw_rad is None:
         raise UsageError(f"can't fly to a waypoint: {problem}")
@@ -162,7 +162,7 @@ class DeadReckoning:
         self._begin = begin
         self._airframe = Airframe()
         self._newest: Fix | None = None
-        self._listener = drone.on_feedback(self._take, inline=True)
+        self._listener = drone.on_feedback(self._add, inline=True)
 
     def __call__(self) -> Fix | None:
         """Return the newest position; None until the vehicle has reported velocity and yaw."""
@@ -172,7 +172,7 @@ class DeadReckoning:
         """Cancel the subscription."""
         self._listener.cancel()
 
-    def _take(self, feedback: Feedback) -> None:
+    def _add(self, feedback: Feedback) -> None:
         self._airframe.add(feedback)
         motion = self._airframe.newest
         if motion is None or motion.at_ns != feedback.captured_ns:
