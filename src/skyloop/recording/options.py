@@ -18,7 +18,7 @@ from skyloop.recording.layout import Channel
 
 VideoEncoding = Literal["auto", "jpeg", "png"]
 
-MB: Final = 1_000_000
+MB: Final = 1_000_000  #: [bytes]
 VIDEO: Final = "video"
 #: Channels to choose from; ``video.CAMERA`` selects one camera.
 CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, Channel.DROPS)), VIDEO)

@@ -149,7 +149,7 @@ def has_room(found: Scan, size: int) -> bool:
 
 
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Yield the schemas, channels and messages of a piece in file order; add what can't be read to ``damaged``."""
+    """Yield the schemas, channels and messages of a piece in file order; report what can't be read to ``damaged``."""
     try:
         if piece.size > MAX_CHUNK:
             raise ValueError(f"a part of {piece.size} bytes, but at most {MAX_CHUNK} are read at once")
@@ -350,7 +350,7 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
             yield Schema.read(ReadDataStream(BytesIO(data[begin:at])))
 
 
-# By the index ---------------------------------------------------------------------------------------------------
+# The index ------------------------------------------------------------------------------------------------------
 #
 # Opens a file without reading all of its records. The index is trusted only if it accounts for every byte of the file,
 # in which case it must agree with scan(). The footer holds the offset and checksum of the summary, which lists the

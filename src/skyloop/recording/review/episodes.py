@@ -99,14 +99,13 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     capture time, and the set-point in effect when the next row begins, which is the response to that image. Hovering is
     stored as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
     instead: each row has the first of these actions at or after its image's capture, and a gap in them ends an episode.
-    ``task``: name of the task where no mark names one. Return the episodes that last at least a second. Raise
-    ``FileFormatError`` if the number of values of a logged action differs from that of the form's set-points.
+    ``task`` names the task where no mark does. Episodes shorter than a second are skipped.
+
+    Raise ``FileFormatError`` if the number of values of a logged action differs from that of the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
-    state_ns, frames = (
-        _times(feedback, "captured_ns"),
-        {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras},
-    )
+    state_ns = _times(feedback, "captured_ns")
+    frames = {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras}
     taught = _taught(tables.get("logs"), form)
     found = []
     for begin_ns, end_ns, what in _parts(feedback, tables.get("logs"), task):
@@ -219,7 +218,7 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in random order
+_KEY_EVERY: Final = 2  #: interval between key frames, in images; small, because training reads images in random order
 _LOOKED_AT_EVERY: Final = 16  #: interval, in rows, between the rows sampled for the statistics
 _THINNED: Final = 4  #: spacing of the rows and columns used from a sampled image
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -231,8 +230,8 @@ class Film:
     """An H.264 MP4 file with one camera's images from all episodes at a fixed rate. It is deleted after an error."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        #: number of rows that repeat the previous image because their own image could not be decoded
-        self.width = self.height = self.repeated = 0
+        self.width = self.height = 0  #: size of the images [px]; 0 before the first one
+        self.repeated = 0  #: number of rows that repeat the previous image because their own could not be decoded
         self._path, self._fps = path, Fraction(fps).limit_denominator(1000)
         self._opened = ExitStack()
         self._container: Any = None

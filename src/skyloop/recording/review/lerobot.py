@@ -24,12 +24,12 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.episodes import Episode, Film, Form, episodes, form_of, numbers_stats
 from skyloop.recording.review.tables import tables
 
-VERSION: Final = "v3.0"
+VERSION: Final = "v3.0"  #: version of the dataset format
 STATE: Final = "observation.state"
 ACTION: Final = "action"
 IMAGES: Final = "observation.images."
-LEAST_FPS: Final = 0.5
-MOST_FPS: Final = 120.0
+LEAST_FPS: Final = 0.5  #: minimum number of rows per second
+MOST_FPS: Final = 120.0  #: maximum number of rows per second
 _FILE: Final = "chunk-000/file-000"
 _CHANNELS: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.LOGS, Channel.FRAMES)
 _OTHERS: Final = {"timestamp": "float32"} | dict.fromkeys(
