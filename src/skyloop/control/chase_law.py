@@ -345,7 +345,7 @@ class ChaseLaw:
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
         moving = state.velocity - own.velocity[:2]
-        sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2
+        sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2  # turn rate of the line of sight
         turn = clamped(self.settings.yaw_gain * error + 0.9 * sweep + sweeping, self.settings.turn_rad_s)
         if abs(turn) > 0.05:
             self._direction = math.copysign(1.0, turn)

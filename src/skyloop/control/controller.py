@@ -44,19 +44,15 @@ class RunSummary:
     notes: tuple[str, ...] = ()  #: descriptions of likely mistakes: a forgotten take-off, a misspelt callback, …
 
     def __str__(self) -> str:
-        return "\n".join((self._counts(), *(f"note: {note}" for note in self.notes)))
-
-    def _counts(self) -> str:
-        return (
+        results = ""
+        if self.results or self.results_dropped or self.results_expired:
+            results = f"{self.results} results ({self.results_dropped} dropped, {self.results_expired} too old), "
+        counts = (
             f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
             f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), "
-            f"{self._results()}{self.overruns} overrun{'' if self.overruns == 1 else 's'}"
+            f"{results}{self.overruns} overrun{'' if self.overruns == 1 else 's'}"
         )
-
-    def _results(self) -> str:
-        if not (self.results or self.results_dropped or self.results_expired):
-            return ""
-        return f"{self.results} results ({self.results_dropped} dropped, {self.results_expired} too old), "
+        return "\n".join((counts, *(f"note: {note}" for note in self.notes)))
 
 
 class Controller:

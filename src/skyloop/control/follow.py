@@ -18,12 +18,12 @@ import numpy as np
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, TurningSearch, VelocityLaw
-from skyloop.control.behaviour import Behaviour
+from skyloop.control.behaviour import LOST, OTHER, SEARCHING, SEEN, Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.messages import Feedback, Points, Polyline, Text
 from skyloop.messages.geometry import wrap_angle
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class FollowLaw(VelocityLaw):
         horizontal = shortened(horizontal * fade, s.speed_m_s)
         up = fade * s.height_gain * offset[2] + speed[2]
         error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
-        sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across
+        sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across  # turn rate of the line of sight
         turn = s.yaw_gain * error + fade * 0.8 * sweep
         velocity = own.stiffened(np.array([*horizontal, up]), s.velocity_gain)
         up = self._within_heights(float(velocity[2]))
@@ -189,12 +189,7 @@ class TargetFilter:
         return unseen_s > 2.0 or (unseen_s >= 0.0 and off > max(1.0, 5 * math.sqrt(spread)))
 
 
-_COLOURS: dict[Mode, Colour] = {
-    Mode.FOLLOWING: (64, 220, 100),
-    Mode.RECOVERING: (255, 180, 60),
-    Mode.SEARCHING: (120, 190, 255),
-}
-_OTHER: Colour = (150, 150, 150)
+_COLOURS = {Mode.FOLLOWING: SEEN, Mode.RECOVERING: LOST, Mode.SEARCHING: SEARCHING}
 
 
 @dataclass(slots=True)
@@ -306,7 +301,7 @@ class FollowMarker(Behaviour):
     def _drawing(self, frame: Frame, seen: list[MarkerSighting], mine: MarkerSighting | None) -> list[Shape]:
         height, width = frame.shape[:2]
         colour = _COLOURS[self.mode]
-        shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in seen if one is not mine]
+        shapes: list[Shape] = [Polyline(one.outline, True, OTHER) for one in seen if one is not mine]
         if mine is None:
             shapes.append(Text(f"{self.mode} marker {self.marker_id}", (8.0, 16.0), colour))
             return shapes

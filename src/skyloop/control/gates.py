@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from skyloop.control.behaviour import Behaviour
+from skyloop.control.behaviour import LOST, SEARCHING, SEEN, Behaviour
 from skyloop.control.course_law import CourseLaw, CourseSettings, GatePlace, Pole
 from skyloop.control.gate_law import GateLaw, GatePhase, GateSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Polyline, Severity, Text
 from skyloop.messages.parameter import WorldGeometry
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import GateDetector, GateSighting, PoleDetector
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-_COLOURS: dict[GatePhase, Colour] = {GatePhase.SEARCHING: (120, 190, 255), GatePhase.RECOVERING: (255, 180, 60)}
-_SEEN: Colour = (64, 220, 100)
+_COLOURS = {GatePhase.SEARCHING: SEARCHING, GatePhase.RECOVERING: LOST}
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,7 +217,7 @@ class FlyThroughGates(Behaviour):
                 self._gate_law.next_gate(turning=gate.turning)
 
     def _drawing(self, gate: GateKind, seen: list[GateSighting]) -> list[Shape]:
-        colour = _COLOURS.get(self.phase, _SEEN)
+        colour = _COLOURS.get(self.phase, SEEN)
         shapes: list[Shape] = [Text(f"{gate.name}: {self.phase.value}", (8.0, 16.0), colour)]
         for one in seen[:1]:
             x, y = one.outline[3]

@@ -22,7 +22,7 @@ import numpy as np
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
-from skyloop.control.behaviour import Behaviour, camera_info
+from skyloop.control.behaviour import LOST, SEARCHING, SEEN, Behaviour, camera_info
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimits, clamped, require_positive, shortened
 from skyloop.control.pid import Gains, VectorPi
@@ -97,10 +97,7 @@ def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gai
     return np.asarray(-gain * (np.linalg.pinv(jacobian, rcond=1e-3) @ error))
 
 
-_SEEN: Colour = (64, 220, 100)
 _WANTED: Colour = (255, 210, 60)
-_LOOKING: Colour = (120, 190, 255)
-_LOST: Colour = (255, 180, 60)
 
 
 class ServoPhase(StrEnum):
@@ -254,7 +251,7 @@ class ImageServo(Behaviour):
         intrinsics = frame.intrinsics
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None or intrinsics is None:
-            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _LOOKING)]
+            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), SEARCHING)]
         if frame.feedback is not None:
             self._focal_px = intrinsics.fx
             self._servo_law.see(normalised(mine.corners, intrinsics), frame.feedback, frame.captured_ns)
@@ -262,8 +259,8 @@ class ImageServo(Behaviour):
         goal = tuple((float(x), float(y)) for x, y in project(rays, intrinsics))
         return [
             Polyline(goal, True, _WANTED),
-            Polyline(mine.outline, True, _SEEN),
-            Text(f"marker {self.marker_id}: {self.error_px:.0f} px off", (8.0, 16.0), _SEEN),
+            Polyline(mine.outline, True, SEEN),
+            Text(f"marker {self.marker_id}: {self.error_px:.0f} px off", (8.0, 16.0), SEEN),
         ]
 
 
@@ -421,8 +418,8 @@ class FlowHover(Behaviour):
         """Track the ground, update the control law and draw the tracked corners."""
         found = None if frame.feedback is None else self._tracker.see(frame, frame.feedback)
         if found is None:
-            return [Text(self.phase.value, (8.0, 16.0), _LOST)]
+            return [Text(self.phase.value, (8.0, 16.0), LOST)]
         place, count = found
         self._flow_law.see(place, frame.captured_ns)
         off = "" if self.off_m is None else f", {self.off_m:.2f} m off"
-        return [Points(self._tracker.points, _SEEN), Text(f"{count} corners{off}", (8.0, 16.0), _SEEN)]
+        return [Points(self._tracker.points, SEEN), Text(f"{count} corners{off}", (8.0, 16.0), SEEN)]

@@ -299,6 +299,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
             return None
         state = np.array([*before.position[:2], *before.velocity[:2], before.turn_rate, *before.extra])
         state, covariance = corrected(state, before.covariance, off, _SEEN, seen)
+        # A height outside its gate does not refuse the measurement; it only restarts the height's filter.
         if not self._height.update(measured[2:], noise[2:, 2:], at_ns):
             self._height.start(measured[2:], noise[2:, 2:], at_ns)
         return _combined(at_ns, state, covariance, self._height.at(at_ns))

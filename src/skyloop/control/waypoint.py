@@ -135,14 +135,12 @@ PositionSource = Callable[[], Fix | None]
 
 def fix_of(feedback: Feedback) -> Fix | None:
     """Return the position from a vehicle's own feedback, at its capture time; None if position or yaw is unknown."""
-    if feedback.position_m is None or feedback.yaw_rad is None:
+    yaw, velocity = feedback.yaw_rad, feedback.velocity_m_s
+    if feedback.position_m is None or yaw is None:
         return None
-    return Fix(
-        feedback.captured_ns,
-        feedback.position_m,
-        feedback.yaw_rad,
-        _world_velocity(feedback.velocity_m_s, feedback.yaw_rad),
-    )
+    if velocity is not None:
+        velocity = *turned(velocity[0], velocity[1], yaw), velocity[2]
+    return Fix(feedback.captured_ns, feedback.position_m, yaw, velocity)
 
 
 class DeadReckoning:
@@ -182,10 +180,3 @@ class DeadReckoning:
         vx, vy, vz = motion.velocity.tolist()
         place = (self._begin[0] + east, self._begin[1] + north, height)
         self._newest = Fix(motion.at_ns, place, motion.yaw, (vx, vy, vz))
-
-
-def _world_velocity(velocity: Vector | None, yaw: float) -> Vector | None:
-    if velocity is None:
-        return None
-    forward, left, up = velocity
-    return *turned(forward, left, yaw), up

@@ -53,7 +53,7 @@ MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 HEADER: Final = struct.Struct(">IIIiiI")
 NAME_LENGTH: Final = struct.Struct(">I")
 POSE: Final = struct.Struct(">ii7d")
-_SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
+_SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]  # servers of other major versions speak another protocol
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,13 +47,9 @@ class FoxgloveServer:
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
     ) -> None:
-        """Start listening.
+        """Start listening; port 0 selects a free port.
 
-        Args:
-            drones: Connected drones, with distinct names.
-            host: Address to listen on.
-            port: Port to listen on; 0 selects a free port.
-            priority: Priority used for viewers' parameter writes, from 0 (highest) to 31; None forbids writing.
+        ``priority``, from 0 (highest) to 31, is used for viewers' parameter writes; None forbids writing.
 
         Raises:
             UsageError: Two drones have the same name, or other machines would be able to write parameters.
@@ -329,11 +325,8 @@ class ParameterAccess:
     ) -> None:
         """Initialise without sending any request.
 
-        Args:
-            drones: Observed drones, with distinct names.
-            priority: Priority used for writes, from 0 (highest) to 31; None forbids writing.
-            on_change: Called with a parameter's name and value on a separate thread: once for each parameter when
-                :meth:`follow` is called, and then after each change.
+        ``priority``, from 0 (highest) to 31, is used for writes; None forbids writing. ``on_change`` is called with a
+        parameter's name and value on a separate thread: once for each when :meth:`follow` is called, and after changes.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
@@ -487,6 +480,7 @@ class OriginGuard:
             if not (more := visitor.recv(_CHUNK)):
                 return
             head += more
+        # Browsers always name the page's origin when opening a WebSocket (RFC 6455, section 4.1); programs need not.
         origins = _ORIGIN.findall(head.partition(b"\r\n\r\n")[0])
         if len(head) >= MAX_HEAD or not all(is_trusted(origin.decode("latin-1")) for origin in origins):
             visitor.sendall(_REFUSED)

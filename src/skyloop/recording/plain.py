@@ -362,8 +362,9 @@ class Course:
             self.first_ns = self.newest_ns = own_ns
         elif -_BACK_NS < own_ns - self.newest_ns < _AHEAD_NS:
             self.newest_ns = max(self.newest_ns, own_ns)
+            # Only feedback dispels a doubt, or shows that a clock was set back: applications set other samples' times.
             self._doubted_ns = None if isinstance(value, Feedback) else self._doubted_ns
-        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # applications may set the times of other samples
+        elif own_ns > self.newest_ns or isinstance(value, Feedback):
             agree = self._doubted_ns is not None and abs(own_ns - self._doubted_ns) < _BACK_NS
             self._doubted_ns = own_ns
             if agree and own_ns < self.newest_ns:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import signal
 import sys
 import threading
@@ -12,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 import msgspec
@@ -35,7 +33,7 @@ from skyloop.recording.options import (
     channels_of,
     first_path,
 )
-from skyloop.recording.taps import Tap, check_names
+from skyloop.recording.taps import Tap, check_names, give_way
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 
@@ -97,7 +95,7 @@ class Engine:
 
     def forked(self) -> None:
         """Leave the file to the parent process. Called in a child created by ``os.fork``."""
-        self._ended_ns = time.monotonic_ns()
+        self._ended_ns = time.monotonic_ns()  # so that stop() does nothing
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Write all received samples and close the file. Idempotent."""
@@ -248,9 +246,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -334,7 +330,6 @@ START_S: Final = 20.0  #: time allowed for the child to start recording
 _END_S: Final = 15.0  # time allowed to write received samples before the child is terminated
 _KILL_AFTER_S: Final = 3.0  # time from terminating the child to killing it
 _REPORT_S: Final = 0.25  # interval between the child's status reports
-_NICE: Final = 5  # niceness of the child, so that flying takes precedence
 _log = logging.getLogger(__name__)
 
 
@@ -363,8 +358,7 @@ def run_child(arguments: ChildArguments) -> int:
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     on_parent_end(stop.set)
-    if hasattr(os, "nice"):
-        os.nice(_NICE)
+    give_way()
     # Events are sent on this thread, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:

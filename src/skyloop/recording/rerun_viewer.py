@@ -91,7 +91,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer: 9876 by default, 0 for any free one. A viewer that already listens there is used.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -152,7 +152,7 @@ class RerunViewer:
         now_ns = time.monotonic_ns()
         self._ahead += item.size
         if now_ns < self._due_ns and (self._stalled or self._ahead < _AHEAD):
-            return not self._stalled
+            return not self._stalled  # as of the last check
         taken = self._shown.taken(_PATIENCE_S)
         if taken == self._stalled:
             self._stalled = not taken
@@ -237,13 +237,7 @@ class Exported:
 def export_rrd(
     recording: Recording, path: Path, *, drone: str | None = None, progress: Progress | None = None
 ) -> Exported:
-    """Export a recording to a file for Rerun.
-
-    Args:
-        recording: The recording.
-        path: The file to write; an existing file is replaced.
-        drone: The name of the drone to export, or None to export all drones.
-        progress: Called with the fraction read so far, 0 to 1.
+    """Export one drone of a recording, or all of them, to a file for Rerun; an existing file is replaced.
 
     Raises:
         UnknownNameError: The recording has no such drone.

@@ -289,7 +289,8 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 def _unpack(piece: Piece, data: bytes) -> bytes:
     """Decompress a chunk's records; if the chunk is truncated, recover as many as its compression format allows.
 
-    Decompress at most as much as the chunk announces, and nothing if it announces too much.
+    Nothing is decompressed if the chunk announces too much, and otherwise at most one byte more than it announces, to
+    notice an excess.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:

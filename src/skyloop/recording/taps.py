@@ -422,7 +422,7 @@ _LIMIT: Final = 16 * MB  # maximum number of bytes held for a slow screen; older
 _RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
 _CHECK_NS: Final = nanoseconds(1.0)  # interval between checks of the video streams
-NICENESS: Final = 5  #: niceness of a viewing process, the same as that of a recording child
+NICENESS: Final = 5  #: niceness of processes that record or show drones
 
 #: The index of a drone, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
 Source = tuple[int, str]

@@ -63,8 +63,8 @@ def write_report(
     _channels(page, summary)
     page.add(
         f"<footer>{escape(recording.path.name)}, recorded by Skyloop {escape(recording.start.skyloop)}. Times are "
+        "seconds since the first sample, on the clock of the drone's proxy.</footer>"
     )
-    page.add("seconds since the first sample, on the clock of the drone's proxy.</footer>")
     page.write(path)
 
 

@@ -58,14 +58,7 @@ def export_mp4(
     depend on missing frames are omitted. Otherwise, all frames are encoded into one file, omitting damaged frames and
     frames that differ in size from the first.
 
-    Args:
-        recording: The recording.
-        drone: The drone's name.
-        camera: The camera's name.
-        path: The file to write.
-        burn_time: Whether to draw the time since the recording's start in a corner of each frame.
-        encode: Whether to re-encode even H.264.
-        progress: Called with the fraction read so far, 0 to 1.
+    ``burn_time`` draws the time since the recording's start in a corner of each frame; ``encode`` re-encodes H.264.
 
     Raises:
         UnknownNameError: The recording has no such drone or camera.
