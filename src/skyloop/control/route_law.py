@@ -132,7 +132,7 @@ class RouteLaw:
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
-        return [Command(Hover()), self._report("paused", why or "as asked")]
+        return [Command(Hover()), self._report("paused", why or "as requested")]
 
     def resume(self) -> list[Effect]:
         """Continue straight to the next waypoint, or to the end of the route if all waypoints were skipped."""
@@ -155,7 +155,7 @@ class RouteLaw:
             return []
         under_way = self.is_under_way
         self.state = RouteState.STOPPED
-        return [*([Command(Hover())] if under_way else []), self._report("stopped", "as asked")]
+        return [*([Command(Hover())] if under_way else []), self._report("stopped", "as requested")]
 
     def photo_done(self, problem: str = "") -> None:
         """Report the result of the photo. Can be called from any thread."""

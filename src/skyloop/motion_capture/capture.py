@@ -79,7 +79,7 @@ class MotionCapture:
             UsageError: ``bodies`` is empty or maps two names to one body.
         """
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
-            raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
+            raise UsageError(f'bodies is {bodies!r} and must map names, such as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
             raise UsageError(f"bodies is {bodies!r} and must not map two names to one body")
         self.system = system

@@ -202,8 +202,8 @@ class SensorSelection:
     def refused(self) -> dict[str, str]:
         """Trackers whose sensor must be specified but isn't, with the reason and a remedy."""
         return {
-            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and the body's is not named: name it "
-            f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
+            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, but which one to use is not specified: "
+            f"name it in bodies, such as {f'{tracker}:{min(sensors)}'!r}, or add ?sensor={min(sensors)} to the address"
             for tracker, (_, sensors) in self._reported.items()
             if sensors != {0}
         }

@@ -156,7 +156,7 @@ class RerunViewer:
         taken = self._shown.taken(_PATIENCE_S)
         if taken == self._stalled:
             self._stalled = not taken
-            _log.warning("Rerun's viewer %s", "accepts data again" if taken else "hangs or is closed: it takes no data")
+            _log.warning("Rerun's viewer %s", "accepts data again" if taken else "hangs or is closed")
         self._ahead = 0
         self._due_ns = now_ns + _CHECK_NS
         return taken

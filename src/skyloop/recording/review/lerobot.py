@@ -137,7 +137,7 @@ def _read(
         form = form or here
         if here != form:
             raise UsageError(
-                f"{recording.path} has {_words(here)}, and {recordings[0].path} {_words(form)}: "
+                f"{recording.path} has {_words(here)}, but {recordings[0].path} has {_words(form)}: "
                 "export mismatched recordings separately, or choose cameras that all of them have"
             )
         flights.append((recording, name, episodes(found, form, task)))

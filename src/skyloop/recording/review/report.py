@@ -352,7 +352,7 @@ def flight_facts(
         if np.isfinite(speed).any():
             found.append(("fastest", f"{np.nanmax(speed):.2f} m/s"))
         if path is not None:
-            found.append(("way", f"{path.length_m:.1f} m"))
+            found.append(("distance", f"{path.length_m:.1f} m"))
         battery = feedback.numbers("battery")
         battery = battery[np.isfinite(battery)]
         if len(battery):
