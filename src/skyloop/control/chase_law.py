@@ -184,7 +184,7 @@ class ChaseLaw:
         self.phase = TargetPhase.LOOKING  #: phase at the last step
         #: estimated minus desired distance at the last step; None if the distance was not controlled
         self.off_m: float | None = None
-        self.held_by = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
+        self.constraint = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
         self._heading: float | None = None  # last known direction of the target's motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
         self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes
@@ -230,7 +230,7 @@ class ChaseLaw:
             self._since_ns = now_ns
         unseen_s = seconds(now_ns - (self._since_ns if seen_ns is None else seen_ns))
         self.phase = self._next_phase(unseen_s, never=target is None or seen_ns is None)
-        self.held_by, self.off_m = "", None
+        self.constraint, self.off_m = "", None
         predicted = None if relative else self._response.predict(now_ns)
         ahead = self._ahead(motion, now_ns, predicted)
         now = _Now(own, ahead, predicted, altitude_m, dt_s, relative)
@@ -466,7 +466,7 @@ class ChaseLaw:
         allowed = 1.2 * (leash - length)
         if outwards <= allowed:
             return wanted
-        self.held_by = "leash"
+        self.constraint = "leash"
         return wanted - direction * (outwards - allowed)
 
     def _up(self, altitude_m: float | None, state: TargetState | None) -> float:

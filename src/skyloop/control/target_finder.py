@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, BoxView, CameraPose, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
 from skyloop.errors import UsageError
@@ -62,7 +62,7 @@ class Sighting:
 @dataclass(slots=True, eq=False)
 class _Seen:
     image: Image
-    camera: Camera
+    camera: CameraPose
     captured_ns: int
     box: Box | None = None  # box of the target
 
@@ -105,7 +105,13 @@ class TargetFinder:
         self._agreed = 0  # number of consecutive images in which tracker and detector agree
 
     def see(
-        self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
+        self,
+        image: Image,
+        camera: CameraPose,
+        captured_ns: int,
+        *,
+        ground: bool,
+        detections: Sequence[Detection] | None,
     ) -> Sighting:
         """Find the target in the next image.
 
@@ -184,7 +190,7 @@ class TargetFinder:
             if number != self._number and each.confirmed and seconds(at_ns - (each.estimator.seen_ns or 0)) < _LATELY_S
         ]
 
-    def _shift(self, camera: Camera, captured_ns: int) -> None:
+    def _shift(self, camera: CameraPose, captured_ns: int) -> None:
         """Shift the tracker by the image motion expected from rotation, flight and the target's own motion."""
         if self.estimator is None or self._middle is None:
             return
@@ -194,7 +200,7 @@ class TargetFinder:
 
     # The tracker ---------------------------------------------------------------------------------------------------
 
-    def _begin(self, box: Box, camera: Camera, captured_ns: int, *, ground: bool) -> None:
+    def _begin(self, box: Box, camera: CameraPose, captured_ns: int, *, ground: bool) -> None:
         traits = self._given or TRAITS.get(self.class_name or "")
         view = BoxView.of(box, camera, _TRACKER_NOISE)
         if view is None:
@@ -202,7 +208,7 @@ class TargetFinder:
         self.estimator = estimator_of(self.class_name, traits, nominal_m=self._nominal_m, relative=self._relative)
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
-    def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
+    def _decide(self, image: Image, camera: CameraPose, captured_ns: int, tracked: TrackResult) -> Sighting:
         """Decide where the target is in this image, from its detection or the tracker."""
         target, estimator = self.target, self.estimator
         if estimator is None:
@@ -221,7 +227,7 @@ class TargetFinder:
         return self._by_tracker(tracked, tracked.box, camera, captured_ns, estimator)
 
     def _by_tracker(
-        self, tracked: TrackResult, box: Box, camera: Camera, captured_ns: int, estimator: TargetEstimator
+        self, tracked: TrackResult, box: Box, camera: CameraPose, captured_ns: int, estimator: TargetEstimator
     ) -> Sighting:
         view = BoxView.of(box, camera, self._tracker_noise)
         if view is None or estimator.seen_ns is None:
@@ -240,7 +246,7 @@ class TargetFinder:
             return Sighting(None, None)
         return Sighting(box, tracked.confidence)
 
-    def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
+    def _is_within_reach(self, view: BoxView, camera: CameraPose, captured_ns: int, estimator: TargetEstimator) -> bool:
         """Return whether an unseen target could have reached the tracker's box and, if so, move the estimate there."""
         assert estimator.seen_ns is not None
         unseen_s = seconds(captured_ns - estimator.seen_ns)

@@ -20,7 +20,7 @@ from skyloop.control.airframe import AirframeLaw, Part, not_ahead
 from skyloop.control.behaviour import LOST, OTHER, SEEN, Behaviour, camera_info
 from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.limiting import Array
-from skyloop.control.target_estimate import Camera, TargetEstimator, Traits, predicted_box
+from skyloop.control.target_estimate import CameraPose, TargetEstimator, Traits, predicted_box
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
@@ -91,7 +91,7 @@ class TargetFollower(AirframeLaw):
         self.finder: TargetFinder | None = None  #: None before the first frame
         self._seen_ns: int | None = None  # capture time of the last frame that showed, or may have shown, the target
         self.sighting = Sighting(None, None)  #: the result of searching the newest frame
-        self._view: Camera | None = None  # camera of the newest frame
+        self._view: CameraPose | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
         self._trace: deque[tuple[int, Array]] = deque()
 
@@ -167,7 +167,7 @@ class TargetFollower(AirframeLaw):
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
         size = (frame.shape[1], frame.shape[0])
         risen_m = None if self._relative else float(motion.position[2])
-        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
+        view = CameraPose.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), LOST)]
         if self.finder is None:
@@ -246,7 +246,7 @@ class TargetFollower(AirframeLaw):
             return self.problem
         if self.sighting.contested:
             return "a look-alike is at its expected position"
-        return "at the end of the leash" if self._law.held_by else ""
+        return "at the end of the leash" if self._law.constraint else ""
 
     def _drawing(self, captured_ns: int) -> list[Shape]:
         assert self.finder is not None

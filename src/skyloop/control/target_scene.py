@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, Traits
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, CameraPose, TargetEstimator, Traits
 from skyloop.estimation import assignment
 from skyloop.vision.object_tracks import Detection
 
@@ -136,7 +136,7 @@ def _is_about(thing: SceneObject, at_ns: int) -> bool:
     return seen_s < _LATELY_S or (seen_s < _TOGETHER_S and seconds(at_ns - thing.contested_ns) < _LATELY_S)
 
 
-def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
+def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: CameraPose, at_ns: int) -> bool:
     """Return whether a detection may show two objects, because another object's centre is in it, not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
@@ -165,7 +165,7 @@ class Scene:
         self._assign = assignment("matching detections", "detect")
 
     def update(
-        self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
+        self, detections: Sequence[Detection], looks: Sequence[Floats], camera: CameraPose, at_ns: int, *, ground: bool
     ) -> None:
         """Match the detections in the next image.
 
@@ -186,7 +186,7 @@ class Scene:
             if new.detection.score >= _SURE:
                 self._add(new, camera, at_ns, ground=ground)
 
-    def _match(self, seen: list[_Seen], camera: Camera, at_ns: int) -> list[_Seen]:
+    def _match(self, seen: list[_Seen], camera: CameraPose, at_ns: int) -> list[_Seen]:
         """Update the objects that match a detection; return the unmatched detections."""
         things = [each for number, each in self.objects.items() if number not in self.dormant]
         if not things or not seen:
@@ -256,7 +256,7 @@ class Scene:
             if float(np.hypot(*before)) > _DIFFER_M_S and float(after @ before) < -_TURNED * float(before @ before):
                 one.exchange(other)
 
-    def _add(self, new: _Seen, camera: Camera, at_ns: int, *, ground: bool) -> None:
+    def _add(self, new: _Seen, camera: CameraPose, at_ns: int, *, ground: bool) -> None:
         name = new.detection.class_name
         estimator = TargetEstimator(self.traits.get(name, UNKNOWN), relative=self._relative)
         estimator.start(new.view, camera, at_ns, ground=ground)

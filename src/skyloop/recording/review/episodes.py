@@ -37,7 +37,7 @@ Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class RowFormat:
     """Defines the columns that each row has."""
 
     state: tuple[str, ...]  #: names of the values in the state, from :data:`~skyloop.messages.rows.STATE`
@@ -66,7 +66,7 @@ class Episode:
         return len(self.state)
 
 
-def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
+def row_format_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> RowFormat:
     """Return the columns available in every row of a recording.
 
     Raise ``FileFormatError`` if the recording has no feedback, no set-points, or no frames of a camera, and
@@ -88,10 +88,10 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
             f"the recorded flight used {' and '.join(sorted(kinds))} set-points: an action is either velocity "
             "(forward, left, up, yaw rate) or attitude (roll, pitch, climb, yaw rate)"
         )
-    return Form(state, kinds.pop(), tuple(cameras), fps)
+    return RowFormat(state, kinds.pop(), tuple(cameras), fps)
 
 
-def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode]:
+def episodes(tables: Mapping[str, Table], form: RowFormat, task: str) -> list[Episode]:
     """Cut a recording into episodes.
 
     An episode lasts while the drone follows set-points without a gap in its images or state. Marks split episodes. Its
@@ -141,7 +141,7 @@ def _piloted(commands: Table) -> NDArray[np.bool_]:
     return given
 
 
-def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
+def _taught(logs: Table | None, form: RowFormat) -> tuple[Times, Floats] | None:
     """Return times and values of the logged actions, or None if there are none."""
     if logs is None or "values" not in logs.columns:
         return None
@@ -189,7 +189,7 @@ def _runs(good: NDArray[np.bool_]) -> list[slice]:
     return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
+def _states(feedback: Table, form: RowFormat, at_ns: Times) -> Floats:
     """Return the state interpolated at the given times, with angles going the shorter way around."""
     times = _times(feedback, "captured_ns")
     columns = []
@@ -202,7 +202,7 @@ def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
     return np.stack(columns, axis=1) if columns else np.empty((len(at_ns), 0))
 
 
-def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
+def _actions(commands: Table, form: RowFormat, by_ns: Times) -> Floats:
     """Return the set-point in effect at the given times, or zeros before the first set-point and while hovering."""
     kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
     times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]

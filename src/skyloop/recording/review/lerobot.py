@@ -21,7 +21,7 @@ from skyloop.files import replacing
 from skyloop.pyav import require_pyav
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording
-from skyloop.recording.review.episodes import Episode, Film, Form, episodes, form_of, numbers_stats
+from skyloop.recording.review.episodes import Episode, Film, RowFormat, episodes, numbers_stats, row_format_of
 from skyloop.recording.review.tables import tables
 
 VERSION: Final = "v3.0"  #: version of the dataset format
@@ -46,7 +46,7 @@ class Exported:
     """The result of an export."""
 
     folder: Path
-    form: Form
+    form: RowFormat
     episodes: int
     rows: int
     repeated: int  #: number of rows whose image could not be decoded, so they repeat the previous image
@@ -123,15 +123,15 @@ def _read(
     fps: float,
     task: str,
     doing: Doing,
-) -> tuple[Form, list[_Flight]]:
-    form: Form | None = None
+) -> tuple[RowFormat, list[_Flight]]:
+    form: RowFormat | None = None
     flights: list[_Flight] = []
     for number, recording in enumerate(recordings):
         doing("reading", number / len(recordings))
         name = recording.drone(drone).name
         try:
             found = tables(recording, name, _CHANNELS)
-            here = form_of(found, recording.cameras(name) if cameras is None else cameras, fps)
+            here = row_format_of(found, recording.cameras(name) if cameras is None else cameras, fps)
         except (FileFormatError, UsageError) as error:
             raise type(error)(f"{recording.path}: {error}") from None
         form = form or here
@@ -146,14 +146,14 @@ def _read(
     return form, flights
 
 
-def _words(form: Form) -> str:
+def _words(form: RowFormat) -> str:
     return f"{form.set_point} set-points, the state {', '.join(form.state)} and the cameras {', '.join(form.cameras)}"
 
 
 # Contents of the files ---------------------------------------------------------------------------------------------
 
 
-def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _rows(whole: Sequence[Episode], form: RowFormat, tasks: Sequence[str]) -> dict[str, NDArray[Any]]:
     lengths = [len(episode) for episode in whole]
     within = np.concatenate([np.arange(length) for length in lengths])
     return {
@@ -167,7 +167,7 @@ def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[st
     }
 
 
-def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
+def _episodes(whole: Sequence[Episode], form: RowFormat) -> dict[str, Any]:
     """Return the rows of each episode and its part of each video."""
     ends = np.cumsum([len(episode) for episode in whole])
     begins = ends - [len(episode) for episode in whole]
@@ -190,7 +190,7 @@ def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
     return columns
 
 
-def _info(whole: Sequence[Episode], form: Form, tasks: Sequence[str], films: Mapping[str, Film]) -> dict[str, Any]:
+def _info(whole: Sequence[Episode], form: RowFormat, tasks: Sequence[str], films: Mapping[str, Film]) -> dict[str, Any]:
     fps = int(form.fps) if form.fps == int(form.fps) else form.fps
     features: dict[str, Any] = {
         STATE: {"dtype": "float32", "shape": [len(form.state)], "names": list(form.state)},
