@@ -29,7 +29,7 @@ from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
 #: Drag on a small quadrotor at a few metres per second [1/s]. Identified values: 0.58 for an AR.Drone 2 (Engel, Sturm
-#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1
+#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.40 for an AR.Drone 1
 #: (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
 _HISTORY_S: Final = 3.0  # length of the motion history
@@ -90,8 +90,8 @@ class Airframe:
     Attributes:
         feedback: The newest sample, with non-finite values removed; None before the first sample.
         by_tilt: Whether the vehicle reports no velocity, so that :class:`TiltVelocity` estimates it from the attitude.
-        interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
-            axes stored before such a gap are wrong by the distance flown during the gap.
+        interruptions: Number of times the motion was unknown for longer than :data:`STALE_S` or the history restarted.
+            Positions in odometry axes stored before that are wrong by the distance flown meanwhile.
     """
 
     def __init__(self, *needs: Part) -> None:

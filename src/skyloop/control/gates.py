@@ -67,7 +67,8 @@ RACE_GATES = (
     GateKind("gate 4", (194, 63, 180)),
 )
 RACE_POLES = (208, 31, 31)  #: colour of the poles in these worlds
-#: The track in the worlds ``race0`` and ``race1``; in ``race2``, everything is displaced by up to 0.45 m.
+#: The track in the world ``race0``. The seed moves the start in ``race1`` and ``race2``, and in ``race2`` the gates and
+#: poles as well, by up to 0.45 m along each horizontal axis.
 RACE_TRACK = Course(
     RACE_GATES,
     (

@@ -74,15 +74,14 @@ def export_lerobot(
     Args:
         recordings: Recordings of similar drones flown in the same way.
         folder: Folder for the dataset; it must be new or empty.
-        drone: The drone's name in each recording, or None to use the first drone in each.
-        cameras: Cameras to export, or None for all cameras of the first recording.
+        drone: The drone's name in each recording; None for the first drone in each.
+        cameras: Cameras to export, which every recording must have; None for all.
         fps: Rows per second.
         task: Name of the task where no mark names one.
         doing: Called to report the progress.
 
     Raises:
-        UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of
-            range.
+        UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of range.
         UnknownNameError: A recording has no such drone.
         FileFormatError: A recording has no feedback, set-points or frames, or no recording contains an episode.
         MissingExtraError: PyArrow, PyAV or OpenCV is not installed.
