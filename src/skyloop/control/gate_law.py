@@ -106,7 +106,7 @@ class GateLaw(VelocityLaw):
         self._search.restart(turning=turning)
 
     def forget(self) -> None:
-        """Forget where the gate is, unless the vehicle has passed it."""
+        """Forget where the gate is, and search for it unless the vehicle has passed it."""
         if self.phase is not GatePhase.PASSED:
             self.phase = GatePhase.SEARCHING
         self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None

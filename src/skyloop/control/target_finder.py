@@ -181,7 +181,7 @@ class TargetFinder:
         return None if found is None else found[1].estimator.at(at_ns)
 
     def others(self, at_ns: int) -> list[TargetState]:
-        """Return the states of objects detected in the last second, excluding the target."""
+        """Return the states of other objects that are confirmed and were detected in the last second."""
         if self._scene is None:
             return []
         return [

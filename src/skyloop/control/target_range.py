@@ -74,8 +74,9 @@ class RangeEstimator(TargetEstimator):
     def start(self, view: BoxView, camera: CameraPose, at_ns: int, *, ground: bool) -> None:
         """Start from the first box, as in :meth:`TargetEstimator.start`.
 
-        If the camera's height is unknown, the hypotheses can't be distinguished. In that case the nominal range is
-        used, and the control law keeps the apparent size constant.
+        If the camera's height is unknown, the hypotheses can't be distinguished. There is then only one filter, whose
+        range follows from the target's size or, if that is unknown, is nominal: the control law then keeps the apparent
+        size constant.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
         self._base_m = _off_climb(camera)

@@ -117,7 +117,7 @@ class Tap:
             video.start()
 
     def stop(self) -> None:
-        """Unsubscribe. When this call returns, all received samples are in the backlog."""
+        """Unsubscribe. Afterwards, the backlog holds all received samples except frames that were not yet encoded."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
