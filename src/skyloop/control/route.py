@@ -276,7 +276,7 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
     """Check each waypoint, each leg and the route as a whole.
 
     The estimated duration is the sum of the time for each leg at its speed, :data:`SETTLE_S` per leg for starting and
-    stopping, and the duration of all actions. The battery is assumed to drain evenly over ``flight_time_s``.
+    stopping, all actions and the final descent. The battery is assumed to drain evenly over ``flight_time_s``.
     """
     found: list[Finding] = []
 

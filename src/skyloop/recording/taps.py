@@ -157,7 +157,6 @@ class Tap:
         self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
     def put_parameter(self, parameter: Parameter) -> None:
-        """Add a parameter to the backlog."""
         self._put(Channel.PARAMETERS.value, Rank.KEPT, parameter, _SIZE)
 
     # On the receiving thread -----------------------------------------------------------------------------------
@@ -377,7 +376,6 @@ class Parameters:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread."""
         self._ended = True
         self._wake.set()
         if self._thread.ident is not None:  # start() may have failed before starting the thread

@@ -240,7 +240,6 @@ class Film:
         self._looked_at: list[NDArray[np.uint8]] = []
 
     def __enter__(self) -> Film:
-        """Open the file."""
         import av
 
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -246,7 +246,6 @@ class _Writer:
             raise UsageError(f"{folder} is not empty: choose another folder for the dataset, or remove it")
 
     def make_folders(self) -> None:
-        """Create the folder of the dataset."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -276,7 +275,6 @@ class _Writer:
         self.table("meta/tasks.parquet", columns, {"pandas": json.dumps(about)})
 
     def json(self, name: str, value: Any) -> None:
-        """Write a JSON file."""
         with self._replacing(name) as part:
             part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
