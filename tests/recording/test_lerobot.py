@@ -184,7 +184,7 @@ def test_recordings_that_do_not_match_are_refused(
 ) -> None:
     monkeypatch.setattr("tests.support.recorded_flights.action_at", lambda plan, at_ms: Attitude(roll=0.1))
     other = write_flight(tmp_path / "other.mcap", PLAN)
-    with pytest.raises(UsageError, match=r"other.mcap has attitude .* and .*flight.mcap velocity"):
+    with pytest.raises(UsageError, match=r"other.mcap has attitude .* but .*flight.mcap has velocity"):
         export_lerobot([Recording.open(recording), Recording.open(other)], tmp_path / "a")
 
 

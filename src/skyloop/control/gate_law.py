@@ -123,7 +123,8 @@ class GateLaw(VelocityLaw):
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        if not self._gate.update(motion.position + to_level @ position, 0.02 + 0.006 * distance**2, captured_ns):
+        deviation = 0.02 + 0.006 * distance**2  # as in FollowLaw.see
+        if not self._gate.update(motion.position + to_level @ position, deviation, captured_ns):
             return
         way = -(to_level @ normal)[:2]
         weight = 0.2 * trust / max(1.0, 0.4 * distance)

@@ -269,6 +269,9 @@ def _size(points: Array) -> float:
     return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
+_PLACE_DEVIATION_M = 0.02  # standard deviation of positions from optical flow
+
+
 class FlowPhase(StrEnum):
     """The phases of :class:`FlowLaw`."""
 
@@ -334,10 +337,10 @@ class FlowLaw(AirframeLaw):
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():
             return
         if self._seen_ns is None or seconds(captured_ns - self._seen_ns) > 1.0:
-            self._filter.start(place, 0.02, captured_ns)
+            self._filter.start(place, _PLACE_DEVIATION_M, captured_ns)
             self._kept = _Kept(newest.yaw_rad, altitude, np.asarray(place, np.float64))
         else:
-            self._filter.update(place, 0.02, captured_ns)
+            self._filter.update(place, _PLACE_DEVIATION_M, captured_ns)
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
