@@ -131,7 +131,8 @@ class RecorderState(StrEnum):
     RECORDING = "recording"
     PAUSED = "paused"  #: the disk can't be written to; essential samples wait, and the write is retried every second
     CLOSED = "closed"  #: closed intentionally; the file is complete
-    FAILED = "failed"  #: its process was killed, or an error ended its thread; data already written remains in the file
+    #: its process was killed, an error ended its thread, or it was closed while paused; data already written remains
+    FAILED = "failed"
 
 
 class Status(msgspec.Struct, frozen=True):
