@@ -484,7 +484,7 @@ class View:
 
     @property
     def dropped(self) -> int:
-        """Samples dropped because the screen or the encoder was too slow. Safe to read from any thread."""
+        """Samples dropped because the screen was too slow. Safe to read from any thread."""
         return sum(tuple(self._backlog.dropped.values()))
 
     # The thread ------------------------------------------------------------------------------------------------

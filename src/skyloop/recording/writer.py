@@ -333,7 +333,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate, write and commit all waiting samples; if a new file is due, start it at a key frame."""
+        """Translate and write all waiting samples, committing when due; start a new file, if due, at a key frame."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
