@@ -234,11 +234,11 @@ def test_it_stays_within_a_leash(leash_m: float) -> None:
     out = [float(np.hypot(*place[:2])) for place in world.places]
     assert max(out) < leash_m + 0.4
     assert out[-1] > leash_m - 0.4
-    assert world.law.held_by == "leash"
+    assert world.law.constraint == "leash"
     assert abs(world.azimuths[-1]) < 0.2, "it keeps turning to the target"
     free = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(leash_m=leash_m))
     free.run(4.0)
-    assert free.law.held_by == ""
+    assert free.law.constraint == ""
 
 
 def test_a_leash_uses_the_position_if_known() -> None:
@@ -246,7 +246,7 @@ def test_a_leash_uses_the_position_if_known() -> None:
     world = ChaseWorld(walk(8.0, 0.0), settings=ChaseSettings(leash_m=2.0), drift_m_s=-0.1)
     world.run(40.0)
     assert max(float(np.hypot(*place[:2])) for place in world.places) < 2.4
-    assert world.law.held_by == "leash"
+    assert world.law.constraint == "leash"
 
 
 def test_it_stays_within_a_leash_when_making_way() -> None:

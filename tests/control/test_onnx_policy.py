@@ -110,7 +110,7 @@ def test_after_a_gap_in_the_frames_the_memory_restarts(drone: Recorder, tmp_path
     [
         ({"output": "kept"}, "both the input memory and the output next_memory, or neither"),
         ({"shape": (1, "n")}, "must take float32 of a fixed shape"),
-        ({"shape": (1 << 21, 1)}, "at most 1048576 numbers"),
+        ({"shape": (1 << 21, 1)}, "at most 1048576 values"),
         ({"after": (2, 4)}, r"takes memory as \(1, 4\) and gives next_memory as \(2, 4\): the two must match"),
     ],
 )

@@ -16,7 +16,7 @@ from skyloop.control.target_estimate import (
     TRAITS,
     UNKNOWN,
     BoxView,
-    Camera,
+    CameraPose,
     TargetEstimator,
     TargetState,
     Traits,
@@ -153,15 +153,15 @@ def test_a_thing_too_small_to_see_has_no_predicted_box() -> None:
 
 def test_a_camera_has_no_pose_before_the_attitude_is_known() -> None:
     lens, origin = FRONT_CAMERA.intrinsics(), np.zeros(3)
-    assert Camera.at(FRONT_CAMERA.info(), Feedback(captured_ns=1, yaw_rad=0.0), origin, lens, SIZE) is None
+    assert CameraPose.at(FRONT_CAMERA.info(), Feedback(captured_ns=1, yaw_rad=0.0), origin, lens, SIZE) is None
 
 
 def test_a_camera_needs_a_known_orientation_but_no_position() -> None:
     lens, origin = FRONT_CAMERA.intrinsics(), np.zeros(3)
     with pytest.raises(UsageError, match="mounted"):
-        Camera.at(CameraInfo("front", 320, 240, 15.0), state(), origin, lens, SIZE)
+        CameraPose.at(CameraInfo("front", 320, 240, 15.0), state(), origin, lens, SIZE)
     plain = CameraInfo("front", 320, 240, 15.0, rotation=FRONT_CAMERA.rotation)
-    camera = Camera.at(plain, state(), origin, lens, SIZE)
+    camera = CameraPose.at(plain, state(), origin, lens, SIZE)
     assert camera is not None
     assert camera.position.tolist() == [0.0, 0.0, 0.0]
 
@@ -395,7 +395,7 @@ def test_without_the_vehicles_velocity_it_expects_harder_turns() -> None:
     assert deviations[1] > 1.04 * deviations[0]
 
 
-def cut_off(**edges: float | None) -> tuple[BoxView, Camera]:
+def cut_off(**edges: float | None) -> tuple[BoxView, CameraPose]:
     camera = camera_at()
     return replace(view_of(camera, np.array([4.0, 0.0, 0.0])), **edges), camera  # type: ignore[arg-type]
 

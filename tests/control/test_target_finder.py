@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.tracking_scenes import texture
 from skyloop.clock import nanoseconds
-from skyloop.control.target_estimate import Camera, Traits
+from skyloop.control.target_estimate import CameraPose, Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.control.target_range import RangeEstimator
 from skyloop.errors import UsageError
@@ -30,7 +30,7 @@ class Walker:
         self.path = path
         self.cloth = texture(np.random.default_rng(seed), 40, 120, colour)
 
-    def box(self, camera: Camera, at_s: float) -> Box:
+    def box(self, camera: CameraPose, at_s: float) -> Box:
         box = box_of(camera, np.array([*self.path(at_s), 0.0]))
         assert box is not None, "the test's thing is out of view"
         return box

@@ -15,7 +15,7 @@ from skyloop.client.frame import Frame
 from skyloop.clock import nanoseconds
 from skyloop.control import ChaseSettings, FollowTarget
 from skyloop.control.chase_law import TargetPhase
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, CameraPose, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.errors import UsageError
 from skyloop.messages.relayed import Shape
@@ -55,7 +55,7 @@ class Watching:
         self.misread = still  # error of its altimeter [m] by time [s]
         self.strayed: Callable[[float], float] | None = None  # error of its integrated velocity; None: unknown
 
-    def view(self, up_m: float) -> tuple[BoxView, Camera]:
+    def view(self, up_m: float) -> tuple[BoxView, CameraPose]:
         self._error = 0.9 * self._error + self._rng.normal(0.0, 0.44, 2)
         foot = np.array([self.away_m, self._speed * self.at_s, self.foot_m])
         camera = camera_at(z=self._z + up_m, yaw=math.atan2(foot[1], foot[0]))
@@ -355,7 +355,7 @@ def test_a_picture_on_a_wall_is_not_flown_into(tmp_path: File) -> None:
         assert frame.feedback is not None
         assert frame.intrinsics is not None
         body, size = np.array(frame.feedback.position_m), (frame.shape[1], frame.shape[0])
-        camera = Camera.at(drone.capabilities.cameras[0], frame.feedback, body, frame.intrinsics, size)
+        camera = CameraPose.at(drone.capabilities.cameras[0], frame.feedback, body, frame.intrinsics, size)
         assert camera is not None
         corners = [camera.pixel(np.array([4.0, y, z])) for y, z in ((0.4, 2.3), (-0.4, 1.7))]
         (left, top), (right, bottom) = (corner for corner in corners if corner is not None)

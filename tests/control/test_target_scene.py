@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds
-from skyloop.control.target_estimate import Camera, Traits
+from skyloop.control.target_estimate import CameraPose, Traits
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
 from skyloop.vision.object_tracks import Detection
 from skyloop.vision.tracking import overlap
@@ -21,7 +21,7 @@ BLUE = np.array([40, 5, -40, 30, 0, -10], np.float32)
 RED = np.array([45, 55, 35, 30, 0, 0], np.float32)
 
 
-def detected(camera: Camera, x: float, y: float, *, name: str = "person", score: float = 0.9) -> Detection:
+def detected(camera: CameraPose, x: float, y: float, *, name: str = "person", score: float = 0.9) -> Detection:
     box = box_of(camera, np.array([x, y, 0.0]))
     assert box is not None, "the test's thing is out of view"
     return Detection(box, score, 0, name)

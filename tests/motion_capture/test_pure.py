@@ -121,14 +121,14 @@ def test_the_velocity_is_right_in_spite_of_noise() -> None:
 def test_an_unseen_body_has_no_pose_and_is_lost_once() -> None:
     track = Track("a")
     assert track.state is TrackState.WAITING
-    assert not track.look(10**12), "a body never seen is not lost"
+    assert not track.update(10**12), "a body never seen is not lost"
     track = fed(0.1)
     assert track.state == "tracked"
-    assert not track.look(499 * MS)
-    assert track.look(500 * MS)
+    assert not track.update(499 * MS)
+    assert track.update(500 * MS)
     assert track.pose is None
     assert track.state == "lost"
-    assert not track.look(900 * MS)
+    assert not track.update(900 * MS)
     found = track.add(1000 * MS, (0.0, 0.0, 1.0), UPRIGHT)
     assert found is not None
     assert found.velocity_m_s is None, "no velocity across a gap"
@@ -140,7 +140,7 @@ def test_an_unchanging_pose_is_not_a_measurement(may_freeze: bool) -> None:
     track = Track("a", may_freeze=may_freeze)
     for n in range(1, 101):
         track.add(n * 10 * MS, (1.0, 2.0, 3.0), UPRIGHT)
-        track.look(n * 10 * MS)
+        track.update(n * 10 * MS)
     assert (track.pose is not None) is may_freeze
     track.end()
     assert track.state is TrackState.ENDED

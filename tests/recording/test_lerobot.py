@@ -20,7 +20,7 @@ from skyloop.messages import Attitude, Feedback
 from skyloop.messages.rows import STATE
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording
-from skyloop.recording.review.episodes import Episode, Form, episodes, form_of
+from skyloop.recording.review.episodes import Episode, RowFormat, episodes, row_format_of
 from skyloop.recording.review.lerobot import export_lerobot
 from skyloop.recording.review.tables import Table, tables
 from tests.support.commands import Ended
@@ -36,9 +36,9 @@ def read(path: Path) -> dict[str, Table]:
     return tables(Recording.open(path), "alpha", CHANNELS)
 
 
-def cut(path: Path, fps: float = 10.0, task: str = "circle") -> tuple[Form, list[Episode]]:
+def cut(path: Path, fps: float = 10.0, task: str = "circle") -> tuple[RowFormat, list[Episode]]:
     found = read(path)
-    form = form_of(found, ["front"], fps)
+    form = row_format_of(found, ["front"], fps)
     return form, episodes(found, form, task)
 
 
@@ -49,7 +49,7 @@ def recording(tmp_path: Path) -> Path:
 
 def test_an_episode_lasts_while_the_drone_follows_set_points(recording: Path) -> None:
     form, (episode,) = cut(recording)
-    assert form == Form(STATE, "velocity", ("front",), 10.0)
+    assert form == RowFormat(STATE, "velocity", ("front",), 10.0)
     assert form.action == ("forward", "left", "up", "yaw_rate")
     assert len(episode) == pytest.approx(0.55 * PLAN.seconds * 10, abs=2), "without take-off and landing"
     assert episode.task == "circle"
@@ -96,7 +96,7 @@ def test_a_gap_in_the_images_ends_an_episode_and_short_ones_are_left_out(tmp_pat
 
 def test_a_mark_starts_another_episode_and_names_its_task(recording: Path) -> None:
     found = read(recording)
-    form = form_of(found, ["front"], 10.0)
+    form = row_format_of(found, ["front"], 10.0)
     logs = found["logs"]
     marked = replace(logs, columns={**logs.columns, "name": np.array(["mark"] * len(logs))})
     first, second = episodes({**found, "logs": marked}, form, "circle")
@@ -106,7 +106,7 @@ def test_a_mark_starts_another_episode_and_names_its_task(recording: Path) -> No
 
 def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_do_not_count(recording: Path) -> None:
     found = read(recording)
-    form = form_of(found, ["front"], 10.0)
+    form = row_format_of(found, ["front"], 10.0)
     commands = found["commands"]
     hovers = replace(
         commands, columns={**commands.columns, "asked": np.where(commands["seq"] > 80, "hover", commands["asked"])}
@@ -116,7 +116,7 @@ def test_hovering_is_a_set_point_of_zeros_and_the_proxys_own_commands_do_not_cou
     assert episode.action[5].any()
     own = replace(commands, columns={**commands.columns, "app_id": np.zeros(len(commands), np.int64)})
     with pytest.raises(FileFormatError, match="no set-points from an application"):
-        form_of({**found, "commands": own}, ["front"], 10.0)
+        row_format_of({**found, "commands": own}, ["front"], 10.0)
 
 
 def taught(found: dict[str, Table], at_ns: Sequence[int], values: Sequence[str]) -> dict[str, Table]:
@@ -156,12 +156,12 @@ def test_logged_arrays_are_read_with_their_own_time(recording: Path) -> None:
 def test_unusable_recordings_are_refused(tmp_path: Path, recording: Path) -> None:
     found = read(recording)
     with pytest.raises(FileFormatError, match="no frames of back"):
-        form_of(found, ["back"], 10.0)
+        row_format_of(found, ["back"], 10.0)
     with pytest.raises(FileFormatError, match="feedback channel"):
-        form_of({"commands": found["commands"]}, [], 10.0)
+        row_format_of({"commands": found["commands"]}, [], 10.0)
     placed = write_flight(tmp_path / "placed.mcap", replace(PLAN, places=True))
     with pytest.raises(UsageError, match="used position set-points"):
-        form_of(read(placed), [], 10.0)
+        row_format_of(read(placed), [], 10.0)
     with pytest.raises(UsageError, match=r"fps is 0 and must be from 0\.5 to 120"):
         export_lerobot([Recording.open(recording)], tmp_path / "a", fps=0)
     with pytest.raises(UnknownNameError, match="beta"):
@@ -184,7 +184,7 @@ def test_recordings_that_do_not_match_are_refused(
 ) -> None:
     monkeypatch.setattr("tests.support.recorded_flights.action_at", lambda plan, at_ms: Attitude(roll=0.1))
     other = write_flight(tmp_path / "other.mcap", PLAN)
-    with pytest.raises(UsageError, match=r"other.mcap has attitude .* and .*flight.mcap velocity"):
+    with pytest.raises(UsageError, match=r"other.mcap has attitude .* but .*flight.mcap has velocity"):
         export_lerobot([Recording.open(recording), Recording.open(other)], tmp_path / "a")
 
 

@@ -100,7 +100,7 @@ def test_it_shows_everything(page: str) -> None:
         "in the air": "1.7 s",
         "highest": "1.20 m",
         "fastest": "0.41 m/s",
-        "way": "2.4 m",
+        "distance": "2.4 m",
         "battery": "100% → 90%",
         "commands": "40",
         "frames": "20",

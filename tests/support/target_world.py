@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds
 from skyloop.control.airframe import Motion, TiltVelocity
 from skyloop.control.chase_law import ChaseLaw, ChaseSettings, FollowMode, TargetPhase
-from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, BoxView, CameraPose, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import estimator_of
 from skyloop.messages import Attitude, Feedback, FlightState
 from skyloop.messages.geometry import wrap_angle
@@ -32,15 +32,15 @@ def state(at_s: float = 0.0, *, roll: float = 0.0, pitch: float = 0.0, yaw: floa
 
 def camera_at(
     x: float = 0.0, y: float = 0.0, z: float = 1.2, *, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
-) -> Camera:
+) -> CameraPose:
     """Return the front camera of a vehicle."""
     attitude = state(roll=roll, pitch=pitch, yaw=yaw)
-    camera = Camera.at(FRONT_CAMERA.info(), attitude, np.array([x, y, z]), FRONT_CAMERA.intrinsics(), SIZE)
+    camera = CameraPose.at(FRONT_CAMERA.info(), attitude, np.array([x, y, z]), FRONT_CAMERA.intrinsics(), SIZE)
     assert camera is not None
     return camera
 
 
-def box_of(camera: Camera, foot: Array, height_m: float = 1.72, width_m: float = 0.5) -> Box | None:
+def box_of(camera: CameraPose, foot: Array, height_m: float = 1.72, width_m: float = 0.5) -> Box | None:
     """Return the box of a flat, upright object that faces the camera, cut at the image's edge; None if out of view."""
     away = foot[:2] - camera.position[:2]
     aside = np.array([-away[1], away[0], 0.0]) / max(1e-9, float(np.hypot(*away))) * width_m / 2
@@ -57,7 +57,7 @@ def box_of(camera: Camera, foot: Array, height_m: float = 1.72, width_m: float =
     return left, top, right - left + 1.0, bottom - top + 1.0
 
 
-def view_of(camera: Camera, foot: Array, height_m: float = 1.72, rng: np.random.Generator | None = None) -> BoxView:
+def view_of(camera: CameraPose, foot: Array, height_m: float = 1.72, rng: np.random.Generator | None = None) -> BoxView:
     """Return what the box of a visible object shows, with a detector's noise."""
     box = box_of(camera, foot, height_m)
     assert box is not None, "the test's thing is out of view"

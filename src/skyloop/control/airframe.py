@@ -29,11 +29,11 @@ from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 
 STALE_S: Final = 0.5  #: age after which a value counts as unknown; after such a gap the odometry may have jumped
 #: Drag on a small quadrotor at a few metres per second [1/s]. Identified values: 0.58 for an AR.Drone 2 (Engel, Sturm
-#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1
+#: and Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.40 for an AR.Drone 1
 #: (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
 _HISTORY_S: Final = 3.0  # length of the motion history
-_SHORTEST_STEP_S: Final = 0.02  # shorter intervals come from delayed samples and give unreliable yaw rates
+_SHORTEST_STEP_S: Final = 0.02  # shorter intervals between samples are due to delays and give unreliable yaw rates
 _EXTRAPOLATE_S: Final = 0.3  # maximum time over which to extrapolate motion
 _TILTING_S: Final = 0.3  # time over which the tilt rate is measured
 _STEEPEST: Final = 0.5  # minimum cosine of the tilt; a vehicle that tilts more does not hold its height
@@ -90,8 +90,8 @@ class Airframe:
     Attributes:
         feedback: The newest sample, with non-finite values removed; None before the first sample.
         by_tilt: Whether the vehicle reports no velocity, so that :class:`TiltVelocity` estimates it from the attitude.
-        interruptions: Number of times the motion was unknown for longer than :data:`STALE_S`. Positions in odometry
-            axes stored before such a gap are wrong by the distance flown during the gap.
+        interruptions: Number of times the motion was unknown for longer than :data:`STALE_S` or the history restarted.
+            Positions in odometry axes stored before that are wrong by the distance flown meanwhile.
     """
 
     def __init__(self, *needs: Part) -> None:
@@ -118,7 +118,7 @@ class Airframe:
         """
         at_ns = feedback.captured_ns
         if self.feedback is not None and seconds(self.feedback.captured_ns - at_ns) > _HISTORY_S:
-            self._begin_anew(at_ns)
+            self._restart_history(at_ns)
         elif self.feedback is not None and at_ns <= self.feedback.captured_ns:
             return
         self.feedback = feedback = _finite(feedback)
@@ -161,7 +161,7 @@ class Airframe:
         return yaw
 
     def position_m(self, now_ns: int, *, longest_s: float = STALE_S) -> Vector | None:
-        """Return the newest position in world axes [m]; None if it is older than ``longest_s``."""
+        """Return the newest position in world axes [m]; None if it is unknown or older than ``longest_s``."""
         position: Vector | None = self._newest(Part.POSITION, now_ns, longest_s)
         return position
 
@@ -171,7 +171,10 @@ class Airframe:
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """Return the motion at a given time [ns], extrapolated from the nearest sample; None if it is unknown."""
+        """Return the motion at a given time [ns], extrapolated from the nearest sample.
+
+        None if there is no sample within :data:`STALE_S`.
+        """
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -211,7 +214,7 @@ class Airframe:
     def _newest(self, part: Part, now_ns: int, longest_s: float = STALE_S) -> Any:
         return self._known[part][1] if abs(self.age_s(part, now_ns)) <= longest_s and part in self._known else None
 
-    def _begin_anew(self, at_ns: int) -> None:
+    def _restart_history(self, at_ns: int) -> None:
         """Restart the history at the last known position, because the vehicle is still close to it."""
         self._known.clear()
         self._tilts.clear()
@@ -378,7 +381,7 @@ def _finite(feedback: Feedback) -> Feedback:
 
 
 class TurningSearch:
-    """Searches with a forward-facing camera: turns on the spot and changes height after each full turn."""
+    """A search with a forward-facing camera: turn on the spot, and change height after each full turn."""
 
     def __init__(
         self,

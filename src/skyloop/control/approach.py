@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from skyloop.clock import seconds
-from skyloop.control.behaviour import Behaviour
+from skyloop.control.behaviour import SEARCHING, SEEN, Behaviour
 from skyloop.control.follow import FollowMarker, FollowSettings, Mode
 from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
 from skyloop.control.limiting import clamped, require_positive
@@ -16,7 +16,7 @@ from skyloop.control.path_law import AlongPath, FollowPath, LookAt
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import FlightState, Polyline, Severity, Text
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import MarkerDetector
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from skyloop.messages import Attitude, Feedback, Vector, Velocity
 
 _LONGEST_STEP_S = 0.2  # maximum time step for moving the station along the arc after a gap between frames
-_LOOKING: Colour = (120, 190, 255)
-_SEEN: Colour = (64, 220, 100)
 
 
 class ApproachMarker(FollowMarker):
@@ -292,15 +290,15 @@ class LandOnMarker(Behaviour):
         law = self._landing_law
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None:
-            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _LOOKING)]
+            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), SEARCHING)]
         if frame.feedback is not None:
             law.see(mine.position_in_body(self._mounting), frame.feedback, frame.captured_ns)
         shapes: list[Shape] = [
-            Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _SEEN),
-            Polyline(mine.outline, True, _SEEN),
+            Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), SEEN),
+            Polyline(mine.outline, True, SEEN),
         ]
         if law.height_m is not None and law.target_speed_m_s is not None:
-            shapes.append(Text(f"{law.height_m:.2f} m over it, at {law.target_speed_m_s:.2f} m/s", (8.0, 32.0), _SEEN))
+            shapes.append(Text(f"{law.height_m:.2f} m over it, at {law.target_speed_m_s:.2f} m/s", (8.0, 32.0), SEEN))
         return shapes
 
     def steer(self, wanted: Velocity | Attitude) -> None:

@@ -12,12 +12,18 @@ from skyloop.control.controller import Controller
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
-from skyloop.messages.relayed import Shape
+from skyloop.messages.relayed import Colour, Shape
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
 BLIND_S = 0.5  #: time without a frame after which the vehicle hovers
+
+# Colours of the drawings on frames.
+SEEN: Colour = (64, 220, 100)  #: target in view
+SEARCHING: Colour = (120, 190, 255)  #: target not found yet
+LOST: Colour = (255, 180, 60)  #: target out of view
+OTHER: Colour = (150, 150, 150)  #: an object that is not the target
 
 
 class Law(Protocol):

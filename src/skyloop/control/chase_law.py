@@ -34,7 +34,7 @@ from skyloop.control.response import Predicted, ResponseSettings, VelocityRespon
 from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Feedback, Value, Vector, Velocity
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import turned, wrap_angle
 
 
 class FollowMode(StrEnum):
@@ -67,7 +67,8 @@ class ChaseSettings:
     """Goals, gains and limits of :class:`ChaseLaw`.
 
     Raises:
-        UsageError: A number is out of range, or ``distance_m`` is not greater than ``nearest_m``.
+        UsageError: A number is out of range, ``distance_m`` is not greater than ``nearest_m``, or ``lowest_m`` is
+            greater than ``highest_m``.
     """
 
     distance_m: float = 4.0  #: horizontal distance between the centres of the vehicle and the target
@@ -78,13 +79,13 @@ class ChaseSettings:
     bearing_rad: float | None = None
     orbit_m_s: float = 0.8  #: speed around the target; positive is counter-clockwise as seen from above
     #: Maximum horizontal distance from the start, not exceeded even to evade a target; None means no leash. It is
-    #: computed from the vehicle's position or, if unknown, from its integrated velocity, which drifts.
+    #: computed from the vehicle's position or, if that is unknown, from its integrated velocity, which drifts.
     leash_m: float | None = None
     height_m: float | None = None  #: height above the ground; None for the height at the start
     lowest_m: float = 0.8  #: minimum height above the ground
     highest_m: float = 4.0  #: maximum height above the ground
-    #: Distance by which to rise (or sink, if rising is impossible) and return, to measure the range of a target that
-    #: may not be on the ground. If None, the vehicle waits without moving until the range is known.
+    #: Distance by which to climb (or descend, if there is no room above) and return, to measure the range of a target
+    #: that may not be on the ground. If None, the vehicle waits without moving until the range is known.
     parallax_m: float | None = 0.4
     #: maximum elevation of the target's centre, up or down, at which the vehicle keeps its height
     steep_rad: float = 0.25
@@ -95,8 +96,7 @@ class ChaseSettings:
     yaw_gain: float = 2.2  #: [1/s]
     height_gain: float = 1.0  #: [1/s]
     round_gain: float = 1.2  #: gain for moving around to ``bearing_rad`` [1/s]
-    #: Maximum horizontal speed. The proxy's ``limits.speed`` applies as well.
-    speed_m_s: float = 4.0
+    speed_m_s: float = 4.0  #: maximum horizontal speed; the proxy's ``limits.speed`` applies as well
     climb_m_s: float = 0.6  #: maximum vertical speed
     turn_rad_s: float = 1.8  #: maximum yaw rate
     #: horizontal acceleration limit for set-points; more would tilt the camera off the target
@@ -153,7 +153,7 @@ class ChaseSettings:
 
 _SMOOTHING_S = 0.4  # time constant for smoothing the target's acceleration
 _SETPOINT_OVER = 1.5  # set-point limit as a multiple of the top speed, because drag keeps a vehicle below its set-point
-_SETPOINT_AHEAD = 4.0  # limit on the set-point's change as a multiple of the vehicle's, because the set-point leads
+_SETPOINT_AHEAD = 4.0  # limit on the set-point's change as a multiple of the acceleration, because set-points lead
 _APPROACH_HORIZON_S = 3.0  # time within which the vehicle gives way to an approaching target
 _CONFIDENT_SIGMA_M = 0.35  # maximum standard deviation for a position to count as certain
 _UNCERTAIN_M = 1.0  # maximum extra clearance from a person whose position is uncertain
@@ -179,13 +179,12 @@ class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state."""
 
     def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
-        """Initialise the control law."""
         self.settings = settings or ChaseSettings()  #: settings, which can be replaced in flight
         self.mode = mode  #: pursuit mode, which can be changed in flight
         self.phase = TargetPhase.LOOKING  #: phase at the last step
         #: estimated minus desired distance at the last step; None if the distance was not controlled
         self.off_m: float | None = None
-        self.held_by = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
+        self.constraint = ""  #: constraint that keeps the vehicle from its goal ("leash"); empty if none
         self._heading: float | None = None  # last known direction of the target's motion
         self._out = np.zeros(2)  # the vehicle's position relative to its start
         self._previous_position: Array | None = None  # the vehicle's position at the last step, in odometry axes
@@ -224,14 +223,14 @@ class ChaseLaw:
         dt_s = 0.0 if self._last_ns is None else within(seconds(now_ns - self._last_ns), 0.0, 0.2)
         self._last_ns = now_ns
         own = motion.moved_to(now_ns)
-        self._note_way(own, position)
+        self._track_offset(own, position)
         if self._height is None and altitude_m is not None:
             self._height = altitude_m
         if self._since_ns is None:
             self._since_ns = now_ns
         unseen_s = seconds(now_ns - (self._since_ns if seen_ns is None else seen_ns))
         self.phase = self._next_phase(unseen_s, never=target is None or seen_ns is None)
-        self.held_by, self.off_m = "", None
+        self.constraint, self.off_m = "", None
         predicted = None if relative else self._response.predict(now_ns)
         ahead = self._ahead(motion, now_ns, predicted)
         now = _Now(own, ahead, predicted, altitude_m, dt_s, relative)
@@ -300,9 +299,7 @@ class ChaseLaw:
             acceleration = shortened(s.velocity_gain * (velocity - now.ahead.velocity[:2]), s.acceleration_m_s2)
             velocity = self._response.setpoint(acceleration, now.predicted)
         setpoint = self._limiter.step(np.array([*own.to_body(velocity), up, turn]), now.dt_s)
-        c, si = math.cos(own.yaw), math.sin(own.yaw)
-        sent = (c * setpoint.forward - si * setpoint.left, si * setpoint.forward + c * setpoint.left)
-        self._response.sent(np.array(sent), own.at_ns)
+        self._response.sent(np.array(turned(setpoint.forward, setpoint.left, own.yaw)), own.at_ns)
         return setpoint
 
     def _next_phase(self, unseen_s: float, *, never: bool) -> TargetPhase:
@@ -326,7 +323,8 @@ class ChaseLaw:
     def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
         """Return the angle [rad] by which to look to the left of the target's expected position, and its rate.
 
-        While hovering, look to both sides, first and furthest the way the target last moved; 0 in other phases.
+        While hovering, the vehicle looks to both sides: first, and further, to the side towards which the target last
+        moved. Both values are 0 in other phases.
         """
         s = self.settings
         if self.phase is not TargetPhase.HOVERING:
@@ -347,7 +345,7 @@ class ChaseLaw:
         across = max(0.5, float(np.hypot(*offset)))
         error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
         moving = state.velocity - own.velocity[:2]
-        sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2
+        sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2  # turn rate of the line of sight
         turn = clamped(self.settings.yaw_gain * error + 0.9 * sweep + sweeping, self.settings.turn_rad_s)
         if abs(turn) > 0.05:
             self._direction = math.copysign(1.0, turn)
@@ -364,7 +362,7 @@ class ChaseLaw:
         self.off_m = near - s.distance_m
         # Approach only at a speed from which the vehicle can stop; back off at the speed given by the gain.
         approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
-        moving = self._soon(state, own.at_ns)
+        moving = self._expected_velocity(state, own.at_ns)
         wanted = moving + sight * approach
         if self.mode is FollowMode.ORBIT:
             wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above, with the target on the left
@@ -376,7 +374,7 @@ class ChaseLaw:
         wanted = wanted + self._evading(own, state)
         return self._kept_off(wanted, state, sight, near)
 
-    def _soon(self, state: TargetState, at_ns: int) -> Array:
+    def _expected_velocity(self, state: TargetState, at_ns: int) -> Array:
         """Return the target's velocity, (2,) [m/s], predicted for the time when the vehicle will have matched it."""
         s, velocity = self.settings, state.velocity
         if self._previous_velocity is not None and at_ns > self._previous_velocity[0]:
@@ -445,8 +443,8 @@ class ChaseLaw:
         allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
         return wanted if closing <= allowed else wanted - sight * (closing - allowed)
 
-    def _note_way(self, own: Motion, position: Vector | None) -> None:
-        """Track the offset from the start, using the position if known, because the integrated velocity drifts."""
+    def _track_offset(self, own: Motion, position: Vector | None) -> None:
+        """Track the offset from the start, from the position if known, because the integrated velocity drifts."""
         here = own.position[:2]
         self._out = self._out + (np.zeros(2) if self._previous_position is None else here - self._previous_position)
         self._previous_position = here
@@ -468,7 +466,7 @@ class ChaseLaw:
         allowed = 1.2 * (leash - length)
         if outwards <= allowed:
             return wanted
-        self.held_by = "leash"
+        self.constraint = "leash"
         return wanted - direction * (outwards - allowed)
 
     def _up(self, altitude_m: float | None, state: TargetState | None) -> float:
@@ -510,7 +508,6 @@ class ChaseLaw:
     def _limits(self, own: Motion) -> None:
         """Apply the limits in the settings, and start the first set-point from the vehicle's own velocity."""
         s = self.settings
-        # Set-points lead the velocity, so they may change faster than the vehicle can accelerate.
         limits = SetpointLimits(
             _SETPOINT_OVER * s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2
         )
@@ -535,7 +532,7 @@ def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
-    """Return the speed [m/s] from which the vehicle can stop within a gap, including its reaction time."""
+    """Return the highest speed [m/s] from which the vehicle can stop within a gap, allowing for its reaction time."""
     react_s, brake = settings.react_s, settings.brake_m_s2
     return brake * (math.sqrt(react_s**2 + 2.0 * max(0.0, gap_m) / brake) - react_s)
 

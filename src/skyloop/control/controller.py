@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skyloop.messages import Event, Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
-_LOOK_S = 0.1  #: interval at which ``until`` is evaluated while no samples arrive
+_POLL_S = 0.1  # interval at which ``until`` is evaluated while no samples arrive
 _SAMPLES: Final = ("on_feedback", "on_frame", "on_result")
 _CALLBACKS: Final = (*_SAMPLES, "on_authority", "on_reload")
 
@@ -39,24 +39,20 @@ class RunSummary:
     seconds: float
     reason: Reason  #: why the run ended
     results: int = 0  #: number of ``on_result`` calls
-    results_dropped: int = 0  #: results replaced by newer ones
+    results_dropped: int = 0  #: results replaced by newer ones while a callback was running
     results_expired: int = 0  #: number of results older than ``result_max_age_s`` when taken from the queue
     notes: tuple[str, ...] = ()  #: descriptions of likely mistakes: a forgotten take-off, a misspelt callback, …
 
     def __str__(self) -> str:
-        return "\n".join((self._counts(), *(f"note: {note}" for note in self.notes)))
-
-    def _counts(self) -> str:
-        return (
+        results = ""
+        if self.results or self.results_dropped or self.results_expired:
+            results = f"{self.results} results ({self.results_dropped} dropped, {self.results_expired} too old), "
+        counts = (
             f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
             f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), "
-            f"{self._results()}{self.overruns} overrun{'' if self.overruns == 1 else 's'}"
+            f"{results}{self.overruns} overrun{'' if self.overruns == 1 else 's'}"
         )
-
-    def _results(self) -> str:
-        if not (self.results or self.results_dropped or self.results_expired):
-            return ""
-        return f"{self.results} results ({self.results_dropped} dropped, {self.results_expired} too old), "
+        return "\n".join((counts, *(f"note: {note}" for note in self.notes)))
 
 
 class Controller:
@@ -156,6 +152,8 @@ class Controller:
 
         Raises:
             UsageError: ``seconds`` is negative or NaN.
+            UnknownNameError: The vehicle has no such camera.
+            UnsupportedError: The vehicle has no camera, but :meth:`on_frame` is overridden.
         """
         if seconds is not None and not seconds >= 0.0:
             raise UsageError(f"seconds is {seconds!r} and must be 0 or more")
@@ -207,7 +205,7 @@ def misspelt(own: type[Controller]) -> Iterator[str]:
 
 
 class _Checks:
-    """Checks a run for beginners' mistakes."""
+    """The checks of a run for beginners' mistakes."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -216,7 +214,7 @@ class _Checks:
         self._last_event = next(reversed(controller.drone.recent_events()), None)
         self._flew = self._steered = False
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Record whether the vehicle is airborne and receives set-points; called throughout the run."""
         newest = self.known.newest
         self._flew = self._flew or (newest is not None and newest.state.airborne)
@@ -278,7 +276,7 @@ class _Run:
             reason = self._over(deadline_ns, until)
             if reason is not None:
                 break
-            left_s = _LOOK_S
+            left_s = _POLL_S
             if deadline_ns is not None:
                 left_s = min(left_s, (deadline_ns - self._inbox.clock()) / NS_PER_S)
             self._inbox.notifier.wait_for(lambda: self._inbox.waiting or self._stopped.is_set(), max(0.0, left_s))
@@ -298,7 +296,7 @@ class _Run:
         )
 
     def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
-        self._checks.look()
+        self._checks.update()
         if self._stopped.is_set():
             return "stopped"
         if self._checks.known.is_ending or self._ended():

@@ -1,8 +1,9 @@
 """A control law that flies a course by a map and corrects the map with camera sightings. Pure.
 
-The map contains the positions of gates and poles. Only odometry gives the vehicle's own position since the start. Each
-gate seen corrects the offset between map and odometry, and each pole seen is moved to its observed position. The route
-to the next gate leads around poles and other gates to a point in front of the opening, then along its axis.
+The map contains the positions of gates and poles. The vehicle's own position is known only from odometry. Sightings
+correct the positions of the next gate and of the poles, and each gate that was passed corrects the offset between map
+and odometry. The route to the next gate leads around poles and other gates to a point in front of the opening, then
+along its axis.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from skyloop.estimation import corrected
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import turned, wrap_angle
 
-_SURE = 3.0  # maximum distance between a sighting and its pole, in standard deviations
+_MATCH_SIGMAS = 3.0  # maximum distance between a sighting and its pole, in standard deviations
 _TILT_RAD = 0.012  # standard deviation of elevations, due to errors of the attitude and of pole tops in the image
-_REPEATED = 3.0  # factor by which to increase the noise, because errors persist from one sighting to the next
+_REPEATED = 3.0  # factor on the standard deviation of the noise: errors persist from one sighting to the next
 _SIDES = 3  # number of viewing directions: along a gate's axis and from either side
 
 
@@ -89,7 +90,10 @@ class CourseLaw(VelocityLaw):
         start: Point = (0.0, 0.0),
         settings: CourseSettings | None = None,
     ) -> None:
-        """Initialise the law; ``start`` is the map position at the first feedback. The map shares its yaw."""
+        """Initialise the law.
+
+        ``start`` is the vehicle's map position at the first feedback. Yaw 0 is the map's x axis.
+        """
         self.settings = s = settings or CourseSettings()
         super().__init__(
             SetpointLimits(s.cruise_m_s * 1.3, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2),
@@ -112,7 +116,7 @@ class CourseLaw(VelocityLaw):
         self._begin_gate(0)
 
     def next_gate(self) -> None:
-        """Advance to the next gate; the measured position of the last one corrects the map."""
+        """Advance to the next gate; if the last one was seen often enough, its measured position corrects the map."""
         if self._seen >= self.settings.sightings:
             learnt = self._gate_at(self.number) - self._nominal(self.number)
             share = self._shift_m**2 / (self._shift_m**2 + self.settings.map_m**2)
@@ -132,7 +136,7 @@ class CourseLaw(VelocityLaw):
             self._heading = np.array([math.cos(heading), math.sin(heading)])
 
     def forget(self) -> None:
-        """Reset the confidence in the map to its initial level, and look at the gate again."""
+        """Add the start's uncertainty to the map's offset, and start again with the current gate unless passed."""
         self._shift_m = math.hypot(self._shift_m, self.settings.start_m)
         if self.phase is not GatePhase.PASSED:
             self._begin_gate(self.number)
@@ -164,7 +168,7 @@ class CourseLaw(VelocityLaw):
         if self._filter.newest is None:
             expected = math.hypot(self.settings.map_m, self._shift_m, 0.05)
             self._filter.start(self._nominal(self.number), expected, captured_ns)
-        if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):
+        if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):  # as in FollowLaw.see
             return
         weight = 0.15 * trust / max(1.0, 0.4 * distance)
         mixed = (1.0 - weight) * self._heading + weight * across
@@ -183,7 +187,7 @@ class CourseLaw(VelocityLaw):
         ahead, rise = ray[:2] / level, float(ray[2]) / level
         sightings = [spot.sighting(motion.position, ahead, rise) for spot in self._poles]
         nearest = min(range(len(sightings)), key=lambda number: sightings[number][0])
-        if sightings[nearest][0] < _SURE:
+        if sightings[nearest][0] < _MATCH_SIGMAS:
             self._poles[nearest].update(sightings[nearest])
 
     def _motion(self, at_ns: int) -> Motion:

@@ -37,7 +37,7 @@ class LowPass(Generic[Signal]):
             UsageError: The time constant is negative or not finite.
         """
         self.time_constant_s = _time_constant(time_constant_s)
-        self.value: Signal | None = value  #: the filtered value; None before the first sample, which passes unchanged
+        self.value: Signal | None = value
 
     @classmethod
     def from_cutoff(cls, frequency_hz: float) -> LowPass[Signal]:

@@ -18,12 +18,12 @@ import numpy as np
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import Motion, Part, TurningSearch, VelocityLaw
-from skyloop.control.behaviour import Behaviour
+from skyloop.control.behaviour import LOST, OTHER, SEARCHING, SEEN, Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import Array, SetpointLimits, clamped, shortened, within
 from skyloop.messages import Feedback, Points, Polyline, Text
 from skyloop.messages.geometry import wrap_angle
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:
@@ -67,7 +67,6 @@ class FollowLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
-        """Initialise the control law."""
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
@@ -133,7 +132,7 @@ class FollowLaw(VelocityLaw):
         horizontal = shortened(horizontal * fade, s.speed_m_s)
         up = fade * s.height_gain * offset[2] + speed[2]
         error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
-        sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across
+        sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across  # turn rate of the line of sight
         turn = s.yaw_gain * error + fade * 0.8 * sweep
         velocity = own.stiffened(np.array([*horizontal, up]), s.velocity_gain)
         up = self._within_heights(float(velocity[2]))
@@ -145,7 +144,6 @@ class FollowLaw(VelocityLaw):
         if self._face is None or float(np.hypot(*self._face)) < 0.3:  # facing up or down, or estimates cancel out
             self.aside_rad = None
             return 0.0
-        # Compute the angle from the vehicle's direction to the marker's normal, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
         self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
         off = wrap_angle(self.station_rad - self.aside_rad)
@@ -191,12 +189,7 @@ class TargetFilter:
         return unseen_s > 2.0 or (unseen_s >= 0.0 and off > max(1.0, 5 * math.sqrt(spread)))
 
 
-_COLOURS: dict[Mode, Colour] = {
-    Mode.FOLLOWING: (64, 220, 100),
-    Mode.RECOVERING: (255, 180, 60),
-    Mode.SEARCHING: (120, 190, 255),
-}
-_OTHER: Colour = (150, 150, 150)
+_COLOURS = {Mode.FOLLOWING: SEEN, Mode.RECOVERING: LOST, Mode.SEARCHING: SEARCHING}
 
 
 @dataclass(slots=True)
@@ -308,7 +301,7 @@ class FollowMarker(Behaviour):
     def _drawing(self, frame: Frame, seen: list[MarkerSighting], mine: MarkerSighting | None) -> list[Shape]:
         height, width = frame.shape[:2]
         colour = _COLOURS[self.mode]
-        shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in seen if one is not mine]
+        shapes: list[Shape] = [Polyline(one.outline, True, OTHER) for one in seen if one is not mine]
         if mine is None:
             shapes.append(Text(f"{self.mode} marker {self.marker_id}", (8.0, 16.0), colour))
             return shapes

@@ -102,7 +102,8 @@ class Formation:
             A report with the drones' final positions and how close they came to each other.
 
         Raises:
-            UsageError: A drone can't be flown by position, two would be closer than ``apart_m``, or none is active.
+            UsageError: A drone can't be flown by position, none is active, there are too few slots or too many, or two
+                drones would come closer than ``apart_m``.
             SwarmError: A drone failed, and the swarm's ``on_error`` is not ``"continue"``.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
@@ -119,7 +120,7 @@ class Formation:
         elapsed_s = 0.0
         for tick in self.drones.ticks(self._rate_hz, limit_s):
             elapsed_s = tick.elapsed_s
-            now, others = self._look(ways)
+            now, others = self._states(ways)
             along, speed = _minimum_jerk(elapsed_s / planned_s)
             goal = {name: _waypoint(a + along * (b - a), yaw) for name, (a, b) in ways.items() if name in now}
             drift = {name: speed / planned_s * (ways[name][1] - ways[name][0]) for name in now}
@@ -141,7 +142,7 @@ class Formation:
         here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
         for _ in self.drones.ticks(self._rate_hz, seconds):
-            now, others = self._look(here)
+            now, others = self._states(here)
             self._steer(now, {name: _waypoint(here[name], None) for name in now}, dict.fromkeys(now, still), others)
         return self._report(here, seconds)
 
@@ -180,7 +181,7 @@ class Formation:
         self._ready()
         slots: dict[str, NDArray[np.float64]] = {}
         for tick in self.drones.ticks(self._rate_hz, seconds):
-            now, others = self._look({leader, *wanted})
+            now, others = self._states({leader, *wanted})
             if leader not in now:
                 break
             first = now.pop(leader)
@@ -192,10 +193,10 @@ class Formation:
 
     # Internals -------------------------------------------------------------------------------------------------
 
-    def _look(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
-        """Return the newest states of the drones steered here and the last known states of all other airborne drones.
+    def _states(self, flown: Container[str]) -> tuple[dict[str, Feedback], dict[str, Feedback]]:
+        """Return the newest states of the ``flown`` drones and the last known states of all other airborne drones.
 
-        A drone steered here fails when its position becomes unknown, and is then treated like the other drones.
+        A flown drone whose position becomes unknown fails, and is then treated like the other drones.
         """
         active, errors = self.drones.feedback(max_age_s=MAX_AGE_S), {}
         for name, sample in active.items():
@@ -210,18 +211,18 @@ class Formation:
             if name in active and name in flown and name not in errors:
                 now[name] = _carried_on(airframe)
                 continue
-            heard = False
+            is_recent = False
             with suppress(SkyloopError):
                 airframe.add(drone.feedback(max_age_s=MAX_AGE_S))
-                heard = True
+                is_recent = True
             if airframe.feedback is not None and airframe.feedback.state is not FlightState.LANDED:
                 last = _carried_on(airframe)
                 if last.position_m is not None:  # keep clear of the drone even if its feedback has stopped
-                    others[name] = last if heard else replace_fields(last, velocity_m_s=None)
+                    others[name] = last if is_recent else replace_fields(last, velocity_m_s=None)
         return now, others
 
     def _ready(self) -> dict[str, Feedback]:
-        """Return each drone's newest feedback; raise UsageError naming the drones that can't be flown by position."""
+        """Return the active drones' newest feedback; raise UsageError if one can't be flown, or none is active."""
         self._closest_m = math.inf
         found = self.drones.feedback(max_age_s=MAX_AGE_S)
         if not found:
@@ -269,7 +270,7 @@ class Formation:
 
     def _arrived(self, goals: Mapping[str, NDArray[np.float64]], yaw: float | None, seconds: float) -> FormationReport:
         report = self._report(goals, seconds)
-        now, _ = self._look(goals)
+        now, _ = self._states(goals)
         late = {
             name: NoAnswerError(f"it is {report.errors_m[name]:.2f} m from its place after {seconds:.1f} s")
             for name in report.errors_m
@@ -284,7 +285,7 @@ class Formation:
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
-        now, _ = self._look(goals)
+        now, _ = self._states(goals)
         slots = {name: _vector(goal) for name, goal in goals.items()}
         errors = {name: math.dist(slots[name], now[name].position_m or slots[name]) for name in slots if name in now}
         spread = self.drones.spread
@@ -314,7 +315,10 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
 
 def _carried_on(airframe: Airframe) -> Feedback:
-    """Return a drone's newest feedback; extrapolate the position if it is missing, and use the last known yaw."""
+    """Return a drone's newest feedback, filling in a missing yaw or position from earlier samples if possible.
+
+    The yaw may be up to 0.5 s old; the position is extrapolated over at most 0.5 s.
+    """
     sample = airframe.feedback
     assert sample is not None, "called only after the first feedback"
     now_ns = sample.captured_ns

@@ -37,12 +37,12 @@ _WITHIN_M = 0.02  # margin by which the path may be closer to a wall than its st
 
 
 class GatePhase(StrEnum):
-    """The phases of :class:`GateLaw`."""
+    """The phases of :class:`GateLaw` and :class:`.course_law.CourseLaw`."""
 
     SEARCHING = "searching for the gate"  #: turning on the spot at a series of heights
     ALIGNING = "moving onto the gate's axis"  #: the gate was seen a moment ago
     RECOVERING = "lost the gate: holding position, turning towards it"
-    GOING = "flying to the gate"  #: flying by the map or a sighting
+    GOING = "flying to the gate"  #: along a route planned on the map
     PASSING = "flying through"  #: aligned and close, flying by odometry
     PASSED = "through"
 
@@ -68,7 +68,7 @@ class GateSettings:
     stand_m: float = 1.7  #: distance in front of the gate at which the vehicle must be aligned
     aligned_m: float = 0.15  #: maximum lateral and vertical offset from the axis
     aligned_rad: float = 0.25  #: maximum heading error
-    cone: float = 0.3  #: additional offset allowed per metre of distance beyond `stand_m`
+    cone: float = 0.3  #: additional offset allowed per metre of distance beyond ``stand_m``
     beyond_m: float = 0.7  #: distance behind the gate at which the gate counts as passed
     fresh_s: float = 0.4  #: time to continue without a sighting
     recovering_s: float = 3.0
@@ -90,7 +90,6 @@ class GateLaw(VelocityLaw):
     """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns]."""
 
     def __init__(self, settings: GateSettings | None = None) -> None:
-        """Initialise the control law."""
         self.settings = s = settings or GateSettings()
         super().__init__(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2), Part.VELOCITY)
         self.phase = GatePhase.SEARCHING  #: phase at the last step
@@ -107,24 +106,25 @@ class GateLaw(VelocityLaw):
         self._search.restart(turning=turning)
 
     def forget(self) -> None:
-        """Forget where the gate is, unless the vehicle has passed it."""
+        """Forget where the gate is, and search for it unless the vehicle has passed it."""
         if self.phase is not GatePhase.PASSED:
             self.phase = GatePhase.SEARCHING
         self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Update with a sighting.
+        """Update with a sighting; ignore it if it is far from earlier ones, or if attitude or motion is unknown.
 
-        The sighting is ignored if the vehicle's attitude or motion is unknown, or if it is far from earlier ones. It
-        consists of the opening's centre, (3,) [m], and the normal of the visible side, in body axes at the time of
-        capture; ``at_capture`` contains the attitude at that time. ``trust`` is the confidence in the normal, 0 to 1.
+        A sighting is the opening's centre, (3,) [m], and the normal of the visible side, both in body axes at the time
+        of capture; ``at_capture`` contains the attitude at that time. ``trust`` is the confidence in the normal, from 0
+        to 1.
         """
         found = self.airframe.at_capture(at_capture, captured_ns, position, normal)
         if found is None:
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        if not self._gate.update(motion.position + to_level @ position, 0.02 + 0.006 * distance**2, captured_ns):
+        deviation = 0.02 + 0.006 * distance**2  # as in FollowLaw.see
+        if not self._gate.update(motion.position + to_level @ position, deviation, captured_ns):
             return
         way = -(to_level @ normal)[:2]
         weight = 0.2 * trust / max(1.0, 0.4 * distance)

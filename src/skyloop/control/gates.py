@@ -7,20 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from skyloop.control.behaviour import Behaviour
+from skyloop.control.behaviour import LOST, SEARCHING, SEEN, Behaviour
 from skyloop.control.course_law import CourseLaw, CourseSettings, GatePlace, Pole
 from skyloop.control.gate_law import GateLaw, GatePhase, GateSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Polyline, Severity, Text
 from skyloop.messages.parameter import WorldGeometry
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.vision import GateDetector, GateSighting, PoleDetector
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-_COLOURS: dict[GatePhase, Colour] = {GatePhase.SEARCHING: (120, 190, 255), GatePhase.RECOVERING: (255, 180, 60)}
-_SEEN: Colour = (64, 220, 100)
+_COLOURS = {GatePhase.SEARCHING: SEARCHING, GatePhase.RECOVERING: LOST}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,8 @@ RACE_GATES = (
     GateKind("gate 4", (194, 63, 180)),
 )
 RACE_POLES = (208, 31, 31)  #: colour of the poles in these worlds
-#: The track in the worlds ``race0`` and ``race1``; in ``race2``, everything is displaced by up to 0.45 m.
+#: The track in the world ``race0``. The seed moves the start in ``race1`` and ``race2``, and in ``race2`` the gates and
+#: poles as well, by up to 0.45 m along each horizontal axis.
 RACE_TRACK = Course(
     RACE_GATES,
     (
@@ -139,7 +139,7 @@ class FlyThroughGates(Behaviour):
             drone: The drone to fly.
             gates: The gates in order, or a course with a map.
             camera: Camera to use; None for the vehicle's first camera.
-            settings: :class:`CourseSettings` with a map, otherwise :class:`GateSettings`; None for the defaults.
+            settings: :class:`CourseSettings` for a course, :class:`GateSettings` for gates; None for the defaults.
 
         Raises:
             UsageError: There are no gates, a colour has no hue, or the settings are for the other control law.
@@ -179,7 +179,7 @@ class FlyThroughGates(Behaviour):
         return self._gates[self.passed] if self.passed < len(self._gates) else None
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Detect the nearest gate of the next colour and update the law."""
+        """Detect the next gate and any poles on the map, update the law, and end the behaviour if the law is stuck."""
         if self.phase is GatePhase.PASSED:
             self._next()
         gate = self.gate
@@ -195,16 +195,14 @@ class FlyThroughGates(Behaviour):
                 frame.captured_ns,
                 trust=1.0 - nearest.ambiguity,
             )
-        if isinstance(self._gate_law, CourseLaw):
-            self._look_for_poles(self._gate_law, frame)
+        law = self._gate_law
+        if isinstance(law, CourseLaw):
+            if self._poles is not None and frame.feedback is not None:
+                for pole in self._poles.detect(frame):
+                    law.see_pole(pole.ray_in_body(self._mounting), frame.feedback, frame.captured_ns)
+            if law.stuck is not None and not self.done:
+                self.finish(law.stuck, Severity.WARNING)
         return self._drawing(gate, seen)
-
-    def _look_for_poles(self, law: CourseLaw, frame: Frame) -> None:
-        if self._poles is not None and frame.feedback is not None:
-            for pole in self._poles.detect(frame):
-                law.see_pole(pole.ray_in_body(self._mounting), frame.feedback, frame.captured_ns)
-        if law.stuck is not None and not self.done:
-            self.finish(law.stuck, Severity.WARNING)
 
     def _next(self) -> None:
         before = self._gates[self.passed]
@@ -220,7 +218,7 @@ class FlyThroughGates(Behaviour):
                 self._gate_law.next_gate(turning=gate.turning)
 
     def _drawing(self, gate: GateKind, seen: list[GateSighting]) -> list[Shape]:
-        colour = _COLOURS.get(self.phase, _SEEN)
+        colour = _COLOURS.get(self.phase, SEEN)
         shapes: list[Shape] = [Text(f"{gate.name}: {self.phase.value}", (8.0, 16.0), colour)]
         for one in seen[:1]:
             x, y = one.outline[3]

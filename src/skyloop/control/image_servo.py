@@ -22,14 +22,14 @@ import numpy as np
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.airframe import AirframeLaw, Part, TurningSearch, VelocityLaw, not_ahead
-from skyloop.control.behaviour import Behaviour, camera_info
+from skyloop.control.behaviour import LOST, SEARCHING, SEEN, Behaviour, camera_info
 from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.control.limiting import GRAVITY_M_S2, Array, SetpointLimits, clamped, require_positive, shortened
 from skyloop.control.pid import Gains, VectorPi
 from skyloop.errors import UsageError
 from skyloop.extend import let_go
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
-from skyloop.messages.geometry import rotation_from_euler, wrap_angle
+from skyloop.messages.geometry import rotation_from_euler, turned, wrap_angle
 from skyloop.messages.relayed import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision import MarkerDetector
@@ -97,10 +97,7 @@ def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gai
     return np.asarray(-gain * (np.linalg.pinv(jacobian, rcond=1e-3) @ error))
 
 
-_SEEN: Colour = (64, 220, 100)
 _WANTED: Colour = (255, 210, 60)
-_LOOKING: Colour = (120, 190, 255)
-_LOST: Colour = (255, 180, 60)
 
 
 class ServoPhase(StrEnum):
@@ -254,7 +251,7 @@ class ImageServo(Behaviour):
         intrinsics = frame.intrinsics
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None or intrinsics is None:
-            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _LOOKING)]
+            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), SEARCHING)]
         if frame.feedback is not None:
             self._focal_px = intrinsics.fx
             self._servo_law.see(normalised(mine.corners, intrinsics), frame.feedback, frame.captured_ns)
@@ -262,14 +259,17 @@ class ImageServo(Behaviour):
         goal = tuple((float(x), float(y)) for x, y in project(rays, intrinsics))
         return [
             Polyline(goal, True, _WANTED),
-            Polyline(mine.outline, True, _SEEN),
-            Text(f"marker {self.marker_id}: {self.error_px:.0f} px off", (8.0, 16.0), _SEEN),
+            Polyline(mine.outline, True, SEEN),
+            Text(f"marker {self.marker_id}: {self.error_px:.0f} px off", (8.0, 16.0), SEEN),
         ]
 
 
 def _size(points: Array) -> float:
     """Return the apparent size of the points: the root mean square distance from their mean."""
     return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+_PLACE_DEVIATION_M = 0.02  # standard deviation of positions from optical flow
 
 
 class FlowPhase(StrEnum):
@@ -314,7 +314,6 @@ class FlowLaw(AirframeLaw):
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
-        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.HEIGHT)
         self.settings = s = settings or FlowSettings()
         self.phase = FlowPhase.WAITING  #: phase at the last step
@@ -330,7 +329,7 @@ class FlowLaw(AirframeLaw):
         self._loop.reset()
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Update with a position at a capture time, (2,) [m], along yaw 0 and to the left of it.
+        """Update with the vehicle's position when a frame was captured, (2,) [m], along yaw 0 and to the left of it.
 
         The first position becomes the position to hold, as does the first one after a gap of more than a second.
         """
@@ -338,10 +337,10 @@ class FlowLaw(AirframeLaw):
         if newest is None or newest.yaw_rad is None or altitude is None or not np.isfinite(place).all():
             return
         if self._seen_ns is None or seconds(captured_ns - self._seen_ns) > 1.0:
-            self._filter.start(place, 0.02, captured_ns)
+            self._filter.start(place, _PLACE_DEVIATION_M, captured_ns)
             self._kept = _Kept(newest.yaw_rad, altitude, np.asarray(place, np.float64))
         else:
-            self._filter.update(place, 0.02, captured_ns)
+            self._filter.update(place, _PLACE_DEVIATION_M, captured_ns)
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
@@ -362,8 +361,7 @@ class FlowLaw(AirframeLaw):
         asked = self._loop.step(off, min(0.2, self._since_s(now_ns))) - s.damping * ahead.velocity
         wanted = shortened(asked, s.tilt_rad * GRAVITY_M_S2)
         self._loop.applied(asked, wanted)
-        c, si = math.cos(yaw), math.sin(yaw)
-        forward, left = c * wanted[0] + si * wanted[1], c * wanted[1] - si * wanted[0]
+        forward, left = turned(float(wanted[0]), float(wanted[1]), -yaw)
         return Attitude(
             roll=-math.atan2(left, GRAVITY_M_S2),
             pitch=math.atan2(forward, GRAVITY_M_S2),
@@ -420,11 +418,11 @@ class FlowHover(Behaviour):
             let_go(self.drone, "the ground is out of view")
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Track the ground."""
+        """Track the ground, update the control law and draw the tracked corners."""
         found = None if frame.feedback is None else self._tracker.see(frame, frame.feedback)
         if found is None:
-            return [Text(self.phase.value, (8.0, 16.0), _LOST)]
+            return [Text(self.phase.value, (8.0, 16.0), LOST)]
         place, count = found
         self._flow_law.see(place, frame.captured_ns)
         off = "" if self.off_m is None else f", {self.off_m:.2f} m off"
-        return [Points(self._tracker.points, _SEEN), Text(f"{count} corners{off}", (8.0, 16.0), _SEEN)]
+        return [Points(self._tracker.points, SEEN), Text(f"{count} corners{off}", (8.0, 16.0), SEEN)]

@@ -22,7 +22,8 @@ from skyloop.control.limiting import Array, require_positive, within
 from skyloop.errors import UsageError
 from skyloop.estimation import corrected, drift
 
-#: Terms added to an innovation's variance so that a nearly exact state does not cause a division by zero.
+#: Lower bounds, absolute and relative, of a term added to an innovation's variance to avoid a division by zero if the
+#: state is nearly exact.
 _EXACT_M2, _ROUNDING = 1e-18, 1e-12
 
 _SEEN = np.eye(2, 7)  # selection of the measured part of the state
@@ -125,7 +126,7 @@ class _Filter(ABC, Generic[_E]):
             at_ns: Time of the measurement.
 
         Returns:
-            Whether the position was used: it must be inside the gate (see :attr:`refused`) and not too old.
+            Whether the position was used: it must be inside the gate and not older than the last one that was used.
 
         Raises:
             UsageError: A shape is wrong, a number is not finite, or estimate and measurement are both exact.
@@ -278,7 +279,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
         self._intensity = intensity_m2_s3
         first = [0.0, 0.0, speed_m_s, speed_m_s, turn_rad_s, extra_m_s2, extra_m_s2]
         self._first = np.diag(np.square(first))
-        self._again = turn_rad_s**2 / 9
+        self._again = turn_rad_s**2 / 9  # variance added to a known turn rate on a restart
         self._wander = turn_wander_rad_s**2
         self._extra, self._fade_s = extra_m_s2**2, extra_s
         self._height = ConstantVelocityFilter(1, intensity_m2_s3=_HEIGHT_INTENSITY_M2_S3, speed_m_s=_CLIMB_M_S)
@@ -286,7 +287,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
     def _started(self, measured: Array, noise: Array, at_ns: int) -> TurnEstimate:
         covariance = self._first + _SEEN.T @ noise[:2, :2] @ _SEEN
         rate = 0.0
-        if self._estimate is not None:  # a target that turned is likely to keep turning
+        if self._estimate is not None:  # a restart: a target that turned is likely to keep turning
             rate, known = self._estimate.turn_rate, float(self._estimate.covariance[4, 4])
             covariance[4, 4] = min(covariance[4, 4], known + self._again)
         height = self._height.start(measured[2:], noise[2:, 2:], at_ns)
@@ -298,6 +299,7 @@ class TurningTargetFilter(_Filter[TurnEstimate]):
             return None
         state = np.array([*before.position[:2], *before.velocity[:2], before.turn_rate, *before.extra])
         state, covariance = corrected(state, before.covariance, off, _SEEN, seen)
+        # A height outside its gate does not refuse the measurement; it only restarts the height's filter.
         if not self._height.update(measured[2:], noise[2:, 2:], at_ns):
             self._height.start(measured[2:], noise[2:, 2:], at_ns)
         return _combined(at_ns, state, covariance, self._height.at(at_ns))

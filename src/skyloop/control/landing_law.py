@@ -66,16 +66,16 @@ class LandingSettings:
 
     descent_m_s: float = 0.45
     cone_m: float = 0.06  #: radius, at the marker, of the cone within which the vehicle descends
-    cone: float = 0.2  #: increase of the cone's radius per metre of height
+    cone: float = 0.2  #: increase of the cone's radius per metre of height above the marker
     view: float = 0.3  #: ratio of offset to height above which the vehicle climbs to see the marker
     #: Height below which the vehicle relies on the filter and descends even if the marker is out of sight, provided
     #: that it is over the marker's centre at the same speed, and the marker moved as predicted ``foresight_s`` earlier.
     commit_m: float = 0.6
-    commit_off_m: float = 0.08
-    commit_m_s: float = 0.25
+    commit_off_m: float = 0.08  #: maximum predicted miss distance
+    commit_m_s: float = 0.25  #: maximum speed relative to the marker
     commit_turn_rad_s: float = 1.2  #: maximum turn rate of the marker for touching down
     foresight_s: float = 0.7
-    foreseen_m: float = 0.08
+    foreseen_m: float = 0.08  #: maximum error of that prediction
     final_descent_m_s: float = 0.65
     #: Miss distance above which a touch-down is aborted; it is also aborted if the marker is out of sight for over
     #: ``blind_s``. Just above the marker (below ``nearly_m``), only a miss of the platform aborts it.
@@ -135,7 +135,7 @@ _MOST_REFUSED = 4  # number of consecutive sightings outside the filter's gate t
 _CONTRADICTED = 2  # number of consecutive sightings outside the filter's gate that abort a touch-down
 _LATEST_S = 0.1  # maximum time over which the turn rate in a frame's feedback is extrapolated
 _REACTION_S = 0.25  # time for which a velocity error shifts the touch-down point before it is corrected
-_JUST = 0.999  # safety factor for the speed limit, because converting a velocity to body axes may round it up
+_SPEED_MARGIN = 0.999  # factor on the speed limit, because converting a velocity to body axes may round it up
 _MOVES_M_S = 0.1  # minimum speed of a marker for its turn rate to matter
 _FRESH_S = 0.2  # maximum age of the velocity for a touch-down to count
 _GIVEN_UP_CLIMB_S = 4.0  # duration of the climb for a vehicle without an altimeter
@@ -171,7 +171,6 @@ class LandingLaw(AirframeLaw):
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
-        """Initialise the control law."""
         super().__init__(Part.ATTITUDE, Part.VELOCITY)
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING  #: phase at the last step
@@ -215,7 +214,7 @@ class LandingLaw(AirframeLaw):
             self._response.add(self.airframe.feedback)
 
     def pause(self) -> None:
-        """Restart from rest with a search, because a landed vehicle may have been flown elsewhere."""
+        """Restart from rest and search, even after touch-down: another client may have flown the vehicle elsewhere."""
         super().pause()
         self._limiter.reset(Velocity())
         self._response.pause()
@@ -274,7 +273,7 @@ class LandingLaw(AirframeLaw):
         self.height_m = None if relative is None else relative.height
         self.phase = self._next_phase(relative, now_ns)
         acceleration, up = self._wanted(own, relative, now_ns)
-        velocity = shortened(self._response.setpoint(acceleration, ahead), _JUST * self.settings.speed_m_s)
+        velocity = shortened(self._response.setpoint(acceleration, ahead), _SPEED_MARGIN * self.settings.speed_m_s)
         up = self._allowed(up + self.settings.climb_gain * (up - float(own.velocity[2])))
         wanted = self._limiter.step(np.array([*velocity, up, self._turn(own)]), self._since_s(now_ns))
         self._response.sent(np.array([wanted.forward, wanted.left]), now_ns)
@@ -425,7 +424,7 @@ def _then(newest: Motion, ahead: Predicted) -> Motion:
 
 
 class SpiralSearch:
-    """Flies an expanding square around its starting point; after the largest square it returns there and starts over.
+    """A search along an expanding square, which returns to its start after the largest square and begins again.
 
     This is the expanding-square search of sea rescue, with a downward-facing camera: International Aeronautical and
     Maritime Search and Rescue Manual, volume II, section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes with quarter turns).

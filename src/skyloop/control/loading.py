@@ -13,13 +13,13 @@ import time
 from collections import deque
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import CodeType, ModuleType, TracebackType
+from types import CodeType, ModuleType
 from typing import Final, Self
 
 from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, SkyloopError, UnknownNameError, UsageError
 
-LOOK_S: Final = 0.1  #: interval at which the files are polled
+POLL_S: Final = 0.1  #: interval at which the files are polled
 Stamp = tuple[int, int, int]  #: modification time [ns], size and inode, which change when a file is saved
 
 
@@ -41,7 +41,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Always compiles the source: Python's cache misses changes of the same size within the same second."""
+    """A loader that always compiles: Python's cache misses changes that keep the size within the same second."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -117,15 +117,15 @@ def load_module(file: Path, what: str) -> ModuleType:
 class Reloader:
     """Watches a controller's file and reloads it on a background thread after each save. A context manager.
 
-    A file counts as saved once it has not changed for ``look_s / 2``, so that no half-written file is loaded.
+    A file counts as saved once it has not changed for ``poll_s / 2``, so that no half-written file is loaded.
     """
 
-    def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
-        """Record the files' state, to be polled every ``look_s``. The thread starts when the context is entered."""
+    def __init__(self, path: str | Path, class_name: str | None = None, *, poll_s: float = POLL_S) -> None:
+        """Record the files' state, to be polled every ``poll_s``. The thread starts when the context is entered."""
         self._path = Path(path)
         self._folder = self._path.resolve().parent
         self._class_name = class_name
-        self._look_s = look_s
+        self._poll_s = poll_s
         self._seen = self._stamps()
         self._loaded: deque[type[Controller] | SkyloopError] = deque(maxlen=1)
         self._saved_at = 0.0
@@ -136,9 +136,7 @@ class Reloader:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._thread.join()
 
@@ -149,15 +147,15 @@ class Reloader:
 
     @property
     def age_s(self) -> float:
-        """Time since the last change was detected [s]."""
+        """Time since a change was last detected [s]."""
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
         """Return the new class or the error that prevented loading it; None if there is nothing new."""
         return self._loaded.popleft() if self._loaded else None
 
-    def look(self) -> None:
-        """Poll the files once and load them if they have changed."""
+    def poll(self) -> None:
+        """Check the files once, and load them if they have changed."""
         found = self._stamps()
         if found == self._seen:
             return
@@ -172,12 +170,12 @@ class Reloader:
         self._seen = {**self._stamps(), **found}  # also watch modules imported by the new version
 
     def _settled(self) -> dict[Path, Stamp]:
-        self._ended.wait(self._look_s / 2)
+        self._ended.wait(self._poll_s / 2)
         return self._stamps()
 
     def _run(self) -> None:
-        while not self._ended.wait(self._look_s):
-            self.look()
+        while not self._ended.wait(self._poll_s):
+            self.poll()
 
     def _load(self) -> type[Controller]:
         """Reload the file and the modules in its folder; on failure, restore the previously loaded modules."""

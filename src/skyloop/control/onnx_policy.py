@@ -27,6 +27,7 @@ from skyloop.vision.opencv import opencv
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
+# Names of the network's inputs and outputs, and keys of its metadata.
 STATE_INPUT: Final = "observation.state"
 IMAGE_INPUT: Final = "observation.images."
 OUTPUT: Final = "action"
@@ -65,7 +66,8 @@ class PolicyNetwork:
     Attributes:
         camera: Name of the camera whose images the network was trained on.
         size: Width and height of input images [px]; other images are scaled.
-        state: Names of the state values. action: ``velocity`` or ``attitude``.
+        state: Names of the state values.
+        action: ``velocity`` or ``attitude``.
 
     Raises:
         MissingExtraError: ONNX Runtime or OpenCV is not installed.
@@ -160,8 +162,8 @@ class PolicyNetwork:
         fixed = all(isinstance(each, int) and each > 0 for each in shape)
         if not fixed or math.prod(shape) > _MOST_MEMORY or kind != "tensor(float)":
             raise FileFormatError(
-                f"{self._path} takes {MEMORY} as {kind} {tuple(shape)}, and must take float32 of a fixed shape, "
-                f"at most {_MOST_MEMORY} numbers"
+                f"{self._path} takes {MEMORY} as {kind} {tuple(shape)}, but must take float32 of a fixed shape with "
+                f"at most {_MOST_MEMORY} values"
             )
         return np.zeros(shape, np.float32)
 
@@ -170,7 +172,7 @@ class PolicyNetwork:
         others = [name for name in inputs if name not in (*pictures, STATE_INPUT, MEMORY)]
         if len(pictures) != 1 or others:
             raise FileFormatError(
-                f"{self._path} has the inputs {', '.join(inputs) or 'none'}, and must have one image, "
+                f"{self._path} has the inputs {', '.join(inputs) or 'none'}, but must have one image, "
                 f"{IMAGE_INPUT}CAMERA, and may have {STATE_INPUT} and {MEMORY}"
             )
         (name,) = pictures
@@ -178,8 +180,8 @@ class PolicyNetwork:
         sized = len(shape) == 4 and all(isinstance(each, int) and 0 < each <= _MOST_SIDE for each in shape[1:])
         if not sized or shape[1] != 3 or inputs[name].type != "tensor(float)":
             raise FileFormatError(
-                f"{self._path} takes {name} as {inputs[name].type} {tuple(shape)}, and must take float32 "
-                f"(1, 3, height, width), each side at most {_MOST_SIDE}"
+                f"{self._path} takes {name} as {inputs[name].type} {tuple(shape)}, but must take float32 of shape "
+                f"(1, 3, height, width), with at most {_MOST_SIDE} pixels on each side"
             )
         return name, name.removeprefix(IMAGE_INPUT), (shape[3], shape[2])
 
@@ -193,7 +195,7 @@ class PolicyNetwork:
         names = tuple(given) if given is not None else self._names(STATE_NAMES, metadata)
         for name in names:
             if name not in STATE:
-                raise UnknownNameError("number of a drone's state", name, STATE)
+                raise UnknownNameError("state value", name, STATE)
         shape = inputs[STATE_INPUT].shape
         if len(shape) != 2 or (isinstance(shape[1], int) and shape[1] != len(names)):
             raise FileFormatError(
@@ -204,7 +206,7 @@ class PolicyNetwork:
     def _action(self, given: str | None, metadata: Mapping[str, str]) -> str:
         if given is not None:
             if given not in ACTIONS:
-                raise UnknownNameError("set-point of a policy", given, ACTIONS)
+                raise UnknownNameError("action of a policy", given, ACTIONS)
             return given
         names = self._names(ACTION_NAMES, metadata)
         for kind, own in ACTIONS.items():
@@ -230,9 +232,9 @@ class OnnxPolicy(Behaviour):
     """Flies by a learned policy: for each frame, a network computes a set-point from the image and the state.
 
     The proxy's limits, zones and failsafe apply as they do for any application. The vehicle hovers, and an event
-    reports why, if no frames arrive, if a state value that the network needs is missing or half a second old, or if the
-    action is not finite. In each case the network's memory is cleared. The vehicle must be airborne when :meth:`run` is
-    called. All callbacks run on the thread that called :meth:`run`.
+    reports why, if no frames arrive, if a state value that the network needs is missing or over half a second old, or
+    if the action is not finite. In each case the network's memory is cleared. The vehicle must be airborne when
+    :meth:`run` is called. All callbacks run on the thread that called :meth:`run`.
     """
 
     name = "policy"

@@ -85,9 +85,7 @@ def _joint_speeds(stretches: Sequence[tuple[float, float]], a: float) -> list[fl
 
 _DIFFERENCE_S = 0.01  # step of the numerical derivative to either side
 
-#: Range of lengths, speeds, accelerations and times that can be divided without underflow or overflow.
-_LEAST: Final = 1e-6
-_MOST: Final = 1e6
+_LEAST, _MOST = 1e-6, 1e6  # range of lengths, speeds, accelerations and times that can be divided without overflow
 
 
 class Path(Protocol):
@@ -178,8 +176,8 @@ class Polyline(_Profiled):
             points: Points, each (3,) [m], at least two of which differ.
             speed_m_s: Speed along the legs.
             acceleration_m_s2: Acceleration at the start and end, at stops, and across the arcs.
-            corner_m: Distance from the corner at which an arc starts, at most half a leg; 0 means a stop at each
-                corner. On an arc the vehicle flies no faster than the acceleration allows.
+            corner_m: Distance from the corner at which an arc starts, limited to half of the shorter leg; 0 means a
+                stop at each corner. On an arc the vehicle flies no faster than the acceleration allows.
 
         Raises:
             UsageError: There are fewer than two different points, or a number is out of range.

@@ -2,7 +2,7 @@
 
 The path's velocity is fed forward with the vehicle's response time as lead, and a PI controller for the position
 removes the remaining error. The integral counteracts wind and errors of the measured velocity (Åström and Hägglund,
-"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at its time of measurement, so
+"Advanced PID Control", ISA 2006, chapter 5). Each position is compared with the path at the time of its measurement, so
 delays cause no error.
 """
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 _LONGEST_STEP_S = 0.5  # maximum advance of the path's time between two fixes
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
-_SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
+_INTEGRAL_SHARE = 0.6  # limit of the integral as a fraction of the maximum speed
 _ALONG_M_S = 0.05  # minimum speed for the direction of flight to determine the yaw
 _NEAR_M = 0.3  # minimum horizontal distance to a point for its bearing to be reliable
 _AHEAD_S = 0.1  # interval for computing the rate of the desired yaw
@@ -158,7 +158,7 @@ class PathLaw:
         self._path = path
         self._yaw = yaw
         limits = self.settings.limits
-        self._loop = VectorPi(self.settings.gains, 3, most=_SHARE * limits.speed_m_s)
+        self._loop = VectorPi(self.settings.gains, 3, most=_INTEGRAL_SHARE * limits.speed_m_s)
         self._limiter = SetpointLimiter(limits)
         self._last: Fix | None = None
         self._wanted_yaw: float | None = None
@@ -207,7 +207,7 @@ class PathLaw:
             return Velocity()
         dt_s = 0.0 if self._last is None else max(0.0, seconds(fix.at_ns - self._last.at_ns))
         self._last = fix
-        self._go_on(min(dt_s, _LONGEST_STEP_S), self._off(fix))
+        self._advance(min(dt_s, _LONGEST_STEP_S), self._off(fix))
         self.off_m = self._off(fix)
         target, _ = self.target
         ahead = self._path.velocity(self.time_s + self.settings.lead_s)
@@ -223,7 +223,7 @@ class PathLaw:
     def _off(self, fix: Fix) -> float:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
-    def _go_on(self, dt_s: float, off_m: float) -> None:
+    def _advance(self, dt_s: float, off_m: float) -> None:
         """Advance the path's time; slow down beyond the leash, and stop beyond twice the leash."""
         share = within(2.0 - off_m / self.settings.leash_m, 0.0, 1.0)
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
@@ -313,7 +313,7 @@ class _PathFlyer(Controller):
         if self._is_overruled(feedback):
             self._law.pause()
         wanted = self._law.step(fix)
-        self._look(self._law, fix)
+        self._after_step(self._law, fix)
         if not self.done:
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
@@ -321,8 +321,8 @@ class _PathFlyer(Controller):
         """Create the control law from the first fix."""
         raise NotImplementedError
 
-    def _look(self, law: PathLaw, fix: Fix) -> None:
-        """Decide how to continue after each step."""
+    def _after_step(self, law: PathLaw, fix: Fix) -> None:
+        """Decide whether to go on to the next part of the flight, or to end it."""
         raise NotImplementedError
 
     def _finish(self) -> None:
@@ -377,12 +377,12 @@ class FollowPath(_PathFlyer):
         """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.path = path
-        self.on_path = False  #: whether the vehicle has reached the start
+        self.on_path = False
 
     def _begin(self, fix: Fix) -> PathLaw:
         return PathLaw(_way(fix.position_m, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
 
-    def _look(self, law: PathLaw, fix: Fix) -> None:
+    def _after_step(self, law: PathLaw, fix: Fix) -> None:
         if self.on_path:
             self.error.add(law.off_m)
         if not law.there(fix):
@@ -452,7 +452,7 @@ class Waypoints(_PathFlyer):
         goal = self.waypoints[0]
         return PathLaw(_way(fix.position_m, goal.position, *self._speed), self.settings, self._mode(goal))
 
-    def _look(self, law: PathLaw, fix: Fix) -> None:
+    def _after_step(self, law: PathLaw, fix: Fix) -> None:
         self.error.add(law.off_m)
         if self._there_ns is None and law.there(fix):
             self._there_ns = fix.at_ns

@@ -1,12 +1,12 @@
 """A model of how a vehicle responds to velocity set-points, used to predict its motion and invert the response. Pure.
 
 The vehicle's own velocity loop is modelled as follows: ``delay_s`` after a set-point was sent, the loop demands a lean
-proportional to the velocity error, plus a trim. The lean follows with a lag of ``lag_s`` and accelerates the vehicle;
-so does the push of the air. The lean is known from the attitude. A Kalman filter for velocity and push attributes the
-remaining acceleration to the push; the trim is the part of the lean that the velocity error does not explain. The model
-includes all set-points in transit, so a control law can use the velocity that the vehicle will have when its set-point
-takes effect, with gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with Dead
-Time", Chemical Engineering Progress 53(5), 1957). Such a law can also cancel the push before it causes an error (a
+proportional to the velocity error, plus a trim. The lean follows with a lag of ``lag_s``. Both the lean and the push of
+the air accelerate the vehicle. The lean is known from the attitude. A Kalman filter for velocity and push attributes
+the remaining acceleration to the push; the trim is the part of the lean that the velocity error does not explain. The
+model includes all set-points in transit, so a control law can use the velocity that the vehicle will have when its
+set-point takes effect, with gains that would otherwise make it oscillate (O. J. M. Smith, "Closer Control of Loops with
+Dead Time", Chemical Engineering Progress 53(5), 1957). Such a law can also cancel the push before it causes an error (a
 disturbance observer: Ohnishi, Shibata and Murakami, "Motion Control for Advanced Mechatronics", IEEE/ASME Trans.
 Mechatronics 1(1), 1996).
 """
@@ -71,7 +71,6 @@ class VelocityResponse:
     """Predicts a vehicle's horizontal motion from its feedback and the set-points in transit."""
 
     def __init__(self, settings: ResponseSettings | None = None) -> None:
-        """Initialise the model."""
         self.settings = settings or ResponseSettings()
         self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: time of effect and velocity
         self._at_ns: int | None = None

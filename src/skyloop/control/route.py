@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 ENDING: Final = ".route.json"
-VERSION: Final = 1
+VERSION: Final = 1  #: version of the file format
 LARGEST_FILE: Final = 65_536  #: maximum size of a route file [bytes]
-MOST_WAYPOINTS: Final = 200
+MOST_WAYPOINTS: Final = 200  #: maximum number of waypoints in a route
 
 Metres = Annotated[float, msgspec.Meta(ge=-10_000.0, le=10_000.0)]
-Angle = Annotated[float, msgspec.Meta(ge=-7.0, le=7.0)]
+Angle = Annotated[float, msgspec.Meta(ge=-7.0, le=7.0)]  # a little more than a full turn either way [rad]
 Speed = Annotated[float, msgspec.Meta(ge=0.05, le=30.0)]
 Seconds = Annotated[float, msgspec.Meta(ge=0.0, le=3600.0)]
 Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -98,12 +98,12 @@ class RouteWaypoint(_Part, frozen=True):
 
     @property
     def position(self) -> Vector:
-        """Return (x, y, z) [m]."""
+        """The position (x, y, z) [m]."""
         return self.x, self.y, self.z
 
     @property
     def goal(self) -> Waypoint:
-        """Return the position and yaw to fly to."""
+        """The position and yaw to fly to."""
         return Waypoint(self.x, self.y, self.z, self.yaw if self.look_at is None else self.yaw_to(self.look_at))
 
     def yaw_to(self, point: Point) -> float:
@@ -120,12 +120,12 @@ class Route(_Part, frozen=True, kw_only=True):
 
     #: waypoints in flight order
     waypoints: Annotated[tuple[RouteWaypoint, ...], msgspec.Meta(min_length=1, max_length=MOST_WAYPOINTS)]
-    name: Name = ""  #: A human-readable name
+    name: Name = ""  #: human-readable name
     speed: Speed = 0.5  #: maximum speed to waypoints that don't set their own [m/s]
     #: what to do after the last waypoint: ``hover``, ``land`` or ``return`` (fly back to the start of the route at the
     #: last waypoint's height and land there)
     end: Literal["hover", "land", "return"] = "hover"
-    version: Literal[1] = VERSION  #: version of the file format
+    version: Literal[1] = VERSION
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -258,9 +258,9 @@ def conditions_of(feedback: Feedback | None, parameters: Mapping[str, Value]) ->
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
-    """Check a route against a drone's newest feedback and parameters. This waits for the proxy's answer.
+    """Check a route against a drone's newest feedback and parameters; observers may do so, too.
 
-    An observer's connection is enough. The check waits up to ``wait_s`` for the first position.
+    Waits for the proxy's answer, and up to ``wait_s`` for the first position.
     """
     feedback = None
     with suppress(LinkError):  # missing feedback becomes a finding
@@ -276,7 +276,7 @@ def check_route(route: Route, conditions: Conditions) -> RouteCheck:
     """Check each waypoint, each leg and the route as a whole.
 
     The estimated duration is the sum of the time for each leg at its speed, :data:`SETTLE_S` per leg for starting and
-    stopping, and the duration of all actions. The battery is assumed to drain evenly over ``flight_time_s``.
+    stopping, all actions and the final descent. The battery is assumed to drain evenly over ``flight_time_s``.
     """
     found: list[Finding] = []
 

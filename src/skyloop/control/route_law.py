@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 TURN_S: Final = 15.0  #: maximum time for a turn
 PHOTO_S: Final = 5.0  #: maximum time for a photo
 SLOWEST: Final = 3.0  #: maximum duration of a leg as a multiple of its duration at full speed
-EXTRA_S: Final = 20.0  #: time added to this maximum; when both have passed, the route pauses
+EXTRA_S: Final = 20.0  #: time added to this maximum; after that, the route pauses
 _NEAR_RAD: Final = 0.12  # maximum yaw error for a look action to be complete
 ENDED: Final = "a failsafe took over: this program sent nothing for a while, or a link was lost"
 TAKEN: Final = "another command of this program replaced it"
@@ -89,7 +89,7 @@ class RouteLaw:
         self.route = route
         self.state = RouteState.READY  #: state of the flight
         self.index = 0  #: index of the next or current waypoint, from 0; past the last one on the return flight
-        self.problem = ""  #: reason why the law paused without a request; otherwise empty
+        self.problem = ""  #: reason why the law paused or stopped without a request; otherwise empty
         self._goals: list[RouteWaypoint] = list(route.waypoints)
         self._step = 0  # index of the waypoint's current action
         self._arrived = False  # whether the vehicle has reached the waypoint and started the actions there
@@ -125,28 +125,28 @@ class RouteLaw:
         if self.route.end == "return":
             x, y, _ = feedback.position_m
             self._goals.append(RouteWaypoint(x, y, self._goals[-1].z))
-        return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
+        return [self._report("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
 
     def pause(self, why: str = "") -> list[Effect]:
         """Hover until :meth:`resume` is called; ``why`` is the reason for a pause that was not requested."""
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
-        return [Command(Hover()), self._tell("paused", why or "as asked")]
+        return [Command(Hover()), self._report("paused", why or "as requested")]
 
     def resume(self) -> list[Effect]:
         """Continue straight to the next waypoint, or to the end of the route if all waypoints were skipped."""
         if self.state is not RouteState.PAUSED:
             return []
         if self._skipped_all:
-            return [self._tell("resumed", "to its end"), *self._finish()]
-        return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
+            return [self._report("resumed", "to its end"), *self._finish()]
+        return [self._report("resumed", f"to {self._what()}"), *self._fly()]
 
     def skip(self) -> list[Effect]:
         """Skip the current waypoint; a paused route stays paused, even if no waypoint is left."""
         if self.over or self.state is RouteState.READY or self._skipped_all:
             return []
-        skipped = self._tell("skipped", self._what())
+        skipped = self._report("skipped", self._what())
         return [skipped, *self._next(fly=self.is_under_way)]
 
     def stop(self) -> list[Effect]:
@@ -155,7 +155,7 @@ class RouteLaw:
             return []
         under_way = self.is_under_way
         self.state = RouteState.STOPPED
-        return [*([Command(Hover())] if under_way else []), self._tell("stopped", "as asked")]
+        return [*([Command(Hover())] if under_way else []), self._report("stopped", "as requested")]
 
     def photo_done(self, problem: str = "") -> None:
         """Report the result of the photo. Can be called from any thread."""
@@ -169,9 +169,9 @@ class RouteLaw:
             return []
         if not feedback.state.airborne:
             self.state, self.problem = RouteState.STOPPED, f"the vehicle is {feedback.state.value}"
-            return [self._tell("stopped", self.problem)]
+            return [self._report("stopped", self.problem)]
         if lacking(feedback):
-            return []  # until then, the proxy makes the vehicle hover
+            return []  # the proxy makes the vehicle hover until its position and yaw are known again
         if self.state is RouteState.FLYING:
             return self._on_the_way(feedback, now_ns)
         return self._act(feedback, now_ns)
@@ -188,7 +188,7 @@ class RouteLaw:
             return self.pause(f"{self._what()} was not reached in time")
         first, self._arrived = not self._arrived, True
         self.state, self._since_ns = RouteState.ACTING, None
-        arrived = [self._tell("waypoint_reached", self._what())] if first else []
+        arrived = [self._report("waypoint_reached", self._what())] if first else []
         return [*arrived, *self._act(feedback, now_ns)]
 
     def _act(self, feedback: Feedback, now_ns: int) -> list[Effect]:
@@ -203,7 +203,7 @@ class RouteLaw:
             if not done:
                 return effects
             if isinstance(action, Photo) or problem:
-                effects.append(self._tell(_name(action), problem or "saved"))
+                effects.append(self._report(_name(action), problem or "saved"))
             self._step, self._since_ns = self._step + 1, None
         return [*effects, *self._next()]
 
@@ -244,7 +244,7 @@ class RouteLaw:
 
     def _finish(self) -> list[Effect]:
         self.state = RouteState.DONE
-        return [Command(Hover() if self.route.end == "hover" else Land()), self._tell("done", self.route.end)]
+        return [Command(Hover() if self.route.end == "hover" else Land()), self._report("done", self.route.end)]
 
     def _fly(self) -> list[Effect]:
         goal: Waypoint = self._goals[self.index].goal
@@ -255,7 +255,7 @@ class RouteLaw:
         last = len(self.route.waypoints)
         return "the start" if self.index >= last else f"waypoint {self.index + 1} of {last}"
 
-    def _tell(self, what: str, text: str) -> Progress:
+    def _report(self, what: str, text: str) -> Progress:
         return Progress(f"route.{what}", min(self.index + 1, len(self.route.waypoints)), text)
 
 
@@ -290,7 +290,7 @@ class FlyRoute(Controller):
         Args:
             drone: The drone to fly.
             route: The route; use :meth:`check` before flying it.
-            folder: Folder for photos, which is created when needed.
+            folder: Folder for photos; it is created when needed.
             on_progress: A function called with each step, on the thread that runs the controller.
         """
         super().__init__(drone)
@@ -356,7 +356,7 @@ class FlyRoute(Controller):
             elif isinstance(effect, TakePhoto):
                 threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
             else:
-                self._tell(effect)
+                self._report(effect)
 
     def _photograph(self, wanted: TakePhoto) -> None:
         try:
@@ -366,7 +366,7 @@ class FlyRoute(Controller):
         else:
             self.law.photo_done()
 
-    def _tell(self, step: Progress) -> None:
+    def _report(self, step: Progress) -> None:
         text = f"{step.kind}: {step.text}"
         bad = step.kind == "route.paused" and bool(self.law.problem)
         self._logged_ns = None  # the remaining waypoints have changed

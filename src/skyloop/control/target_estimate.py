@@ -32,8 +32,8 @@ from skyloop.poses import mounting_rotation
 from skyloop.vision.lens import project, unproject
 from skyloop.vision.tracking import Box
 
-_CUT_PX: Final = 2.0  # distance to the image's edge within which a box may be cut off [px] ...
-_CUT: Final = 0.07
+_CUT_PX: Final = 2.0  # distance to the image's edge within which a box may be cut off [px], ...
+_CUT: Final = 0.07  # ... or this fraction of the box's height if that is more
 _BESIDE: Final = 0.75  # maximum distance from the optical axis as a fraction of the image size; 0.5 is the edge
 _STEEPEST: Final = 0.15  # minimum cosine of the elevation: objects almost straight above or below have no azimuth
 _TILT_RAD: Final = 0.008  # error of roll and pitch at the time of capture, which shifts both edges equally
@@ -42,7 +42,7 @@ _UNTIMELY_S: Final = 0.06  # delay of images stamped on arrival, due to encoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class CameraPose:
     """The pose of a camera when it captured an image."""
 
     position: Array  #: position in odometry axes, (3,) [m]; the third value is the height above the ground, if known
@@ -64,7 +64,7 @@ class Camera:
         size: tuple[int, int],
         rates_rad_s: tuple[float, float] = (0.0, 0.0),
         risen_m: float | None = None,
-    ) -> Camera | None:
+    ) -> CameraPose | None:
         """Determine a camera's pose; None if the attitude is unknown.
 
         ``body`` is the vehicle's position, (3,) [m]; its third value is the height above the ground, if known. If
@@ -116,7 +116,7 @@ class BoxView:
     tilt: float = _TILT_RAD  #: standard deviation common to both edges
 
     @classmethod
-    def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
+    def of(cls, box: Sequence[float], camera: CameraPose, noise: float = 0.04) -> BoxView | None:
         """Compute the directions for a box (x, y, width, height [px]); None if it is almost straight above or below.
 
         ``noise`` is the standard deviation of an edge as a fraction of the box's height; one pixel is added. The result
@@ -150,7 +150,7 @@ class BoxView:
         )
 
 
-def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
+def predicted_box(camera: CameraPose, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
     """Return an upright object's approximate box [px], given its aspect ratio; None if it is not fully in view."""
     low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
     if low is None or high is None or low[1] - high[1] < 1.0:
@@ -265,7 +265,7 @@ class TargetEstimator:
         self._before: deque[_Estimate] = deque()  # estimates from earlier boxes, up to _BEFORE_S old
         self._interval_s = 0.0  # time between the last two boxes
 
-    def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
+    def start(self, view: BoxView, camera: CameraPose, at_ns: int, *, ground: bool) -> None:
         """Start from a first box; ``ground`` states whether the camera's height above the ground is known."""
         traits, height = self.traits, float(camera.position[2])
         ground = ground and traits.on_ground is not False
@@ -306,7 +306,7 @@ class TargetEstimator:
             covariance[5, 5] += share**2
         self._begin(self._state, covariance, camera, at_ns)
 
-    def start_at(self, distance_m: float, share: float, view: BoxView, camera: Camera, at_ns: int) -> None:
+    def start_at(self, distance_m: float, share: float, view: BoxView, camera: CameraPose, at_ns: int) -> None:
         """Start from a first box at a guessed range, with the target size that explains the box.
 
         ``share`` is the relative standard deviation of the range. The foot's position and height scale with it.
@@ -335,7 +335,7 @@ class TargetEstimator:
         self._intensity += self.traits.intensity_m2_s3 * (pace**2 - 1.0)
         self._covariance[2:4, 2:4] = np.eye(2) * pace**2
 
-    def _begin(self, state: Array, covariance: Array, camera: Camera, at_ns: int) -> None:
+    def _begin(self, state: Array, covariance: Array, camera: CameraPose, at_ns: int) -> None:
         self._state, self._covariance = state, covariance
         self._at_ns = self.seen_ns = at_ns
         self._eye = camera.position
@@ -343,7 +343,7 @@ class TargetEstimator:
         self._before.clear()
         self._remember(at_ns)
 
-    def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
+    def distance(self, view: BoxView, camera: CameraPose, at_ns: int) -> tuple[float, float]:
         """Measure how badly a box fits.
 
         Return the squared Mahalanobis distance divided by the number of measurements (about 1 for the target's own
@@ -359,7 +359,7 @@ class TargetEstimator:
         squared = float(off @ np.linalg.solve(spread, off))
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 
-    def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
+    def update(self, view: BoxView, camera: CameraPose, at_ns: int) -> bool:
         """Update with a box and return whether it was used; ignore boxes over half a second older than the newest.
 
         Edges far from where they are expected count as hidden and are ignored. Boxes in other directions are refused.
@@ -450,7 +450,7 @@ def _moved(state: Array, dt_s: float) -> Array:
     return moved
 
 
-def _innovation(view: BoxView, camera: Camera, state: Array, radius_m: float) -> tuple[Array, Array, Array]:
+def _innovation(view: BoxView, camera: CameraPose, state: Array, radius_m: float) -> tuple[Array, Array, Array]:
     """Return measured minus expected values (azimuth first), their Jacobian for the state, and the noise covariance."""
     eye = camera.position
     dx, dy = float(state[0] - eye[0]), float(state[1] - eye[1])

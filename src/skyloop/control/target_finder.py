@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, BoxView, Camera, TargetEstimator, TargetState, Traits
+from skyloop.control.target_estimate import TRAITS, BoxView, CameraPose, TargetEstimator, TargetState, Traits
 from skyloop.control.target_range import RangeEstimator, estimator_of
 from skyloop.control.target_scene import Scene, SceneObject, unlikeness
 from skyloop.errors import UsageError
@@ -28,7 +28,7 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, 
 _SAME: Final = 0.4  # minimum overlap of two boxes that show the same object
 _POINTED_AT: Final = 0.3  # minimum overlap between the user's box and the detection that it selects
 _TRACKER_NOISE: Final = 0.06  # noise of the tracker's edges as a fraction of the box height; detectors are sharper
-_BESIDE_LATE: Final = 0.25  # tracker noise when late detections provide the size, because the tracker's size drifts
+_TRACKER_NOISE_LATE: Final = 0.25  # the same while late detections provide the size, because the tracker's size drifts
 _TAKEN: Final = 0.5  # if this fraction of the tracker's box is inside another object's box, it contains that object
 _FITS: Final = 12.0  # maximum squared Mahalanobis distance per measurement for a box of the target
 _DOUBT: Final = 6  # number of consecutive images with an impossible box after which the tracker is corrected
@@ -62,7 +62,7 @@ class Sighting:
 @dataclass(slots=True, eq=False)
 class _Seen:
     image: Image
-    camera: Camera
+    camera: CameraPose
     captured_ns: int
     box: Box | None = None  # box of the target
 
@@ -105,11 +105,18 @@ class TargetFinder:
         self._agreed = 0  # number of consecutive images in which tracker and detector agree
 
     def see(
-        self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
+        self,
+        image: Image,
+        camera: CameraPose,
+        captured_ns: int,
+        *,
+        ground: bool,
+        detections: Sequence[Detection] | None,
     ) -> Sighting:
-        """Find the target in the next image; ``detections`` is None if no detector searched it.
+        """Find the target in the next image.
 
-        ``ground`` states whether the camera's height above the ground is known.
+        ``ground`` states whether the camera's height above the ground is known. ``detections`` is None if no detector
+        has searched the image.
         """
         self._frames.append(_Seen(image, camera, captured_ns))
         self._ground = ground
@@ -144,7 +151,7 @@ class TargetFinder:
         self._ground = ground
         self._use(detections, frame, TrackResult(frame.box, 0.0), ground=ground)
         target = self.target
-        self._tracker_noise = _TRACKER_NOISE if target is None else _BESIDE_LATE
+        self._tracker_noise = _TRACKER_NOISE if target is None else _TRACKER_NOISE_LATE
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
@@ -174,7 +181,7 @@ class TargetFinder:
         return None if found is None else found[1].estimator.at(at_ns)
 
     def others(self, at_ns: int) -> list[TargetState]:
-        """Return the states of objects detected in the last second, excluding the target."""
+        """Return the states of other objects that are confirmed and were detected in the last second."""
         if self._scene is None:
             return []
         return [
@@ -183,7 +190,7 @@ class TargetFinder:
             if number != self._number and each.confirmed and seconds(at_ns - (each.estimator.seen_ns or 0)) < _LATELY_S
         ]
 
-    def _shift(self, camera: Camera, captured_ns: int) -> None:
+    def _shift(self, camera: CameraPose, captured_ns: int) -> None:
         """Shift the tracker by the image motion expected from rotation, flight and the target's own motion."""
         if self.estimator is None or self._middle is None:
             return
@@ -193,7 +200,7 @@ class TargetFinder:
 
     # The tracker ---------------------------------------------------------------------------------------------------
 
-    def _begin(self, box: Box, camera: Camera, captured_ns: int, *, ground: bool) -> None:
+    def _begin(self, box: Box, camera: CameraPose, captured_ns: int, *, ground: bool) -> None:
         traits = self._given or TRAITS.get(self.class_name or "")
         view = BoxView.of(box, camera, _TRACKER_NOISE)
         if view is None:
@@ -201,7 +208,7 @@ class TargetFinder:
         self.estimator = estimator_of(self.class_name, traits, nominal_m=self._nominal_m, relative=self._relative)
         self.estimator.start(view, camera, captured_ns, ground=ground)
 
-    def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
+    def _decide(self, image: Image, camera: CameraPose, captured_ns: int, tracked: TrackResult) -> Sighting:
         """Decide where the target is in this image, from its detection or the tracker."""
         target, estimator = self.target, self.estimator
         if estimator is None:
@@ -220,7 +227,7 @@ class TargetFinder:
         return self._by_tracker(tracked, tracked.box, camera, captured_ns, estimator)
 
     def _by_tracker(
-        self, tracked: TrackResult, box: Box, camera: Camera, captured_ns: int, estimator: TargetEstimator
+        self, tracked: TrackResult, box: Box, camera: CameraPose, captured_ns: int, estimator: TargetEstimator
     ) -> Sighting:
         view = BoxView.of(box, camera, self._tracker_noise)
         if view is None or estimator.seen_ns is None:
@@ -239,7 +246,7 @@ class TargetFinder:
             return Sighting(None, None)
         return Sighting(box, tracked.confidence)
 
-    def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
+    def _is_within_reach(self, view: BoxView, camera: CameraPose, captured_ns: int, estimator: TargetEstimator) -> bool:
         """Return whether an unseen target could have reached the tracker's box and, if so, move the estimate there."""
         assert estimator.seen_ns is not None
         unseen_s = seconds(captured_ns - estimator.seen_ns)

@@ -17,14 +17,14 @@ import numpy as np
 
 from skyloop.clock import seconds
 from skyloop.control.airframe import AirframeLaw, Part, not_ahead
-from skyloop.control.behaviour import Behaviour, camera_info
+from skyloop.control.behaviour import LOST, OTHER, SEEN, Behaviour, camera_info
 from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
 from skyloop.control.limiting import Array
-from skyloop.control.target_estimate import Camera, TargetEstimator, Traits, predicted_box
+from skyloop.control.target_estimate import CameraPose, TargetEstimator, Traits, predicted_box
 from skyloop.control.target_finder import Sighting, TargetFinder
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
-from skyloop.messages.relayed import Colour, Shape
+from skyloop.messages.relayed import Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision.object_tracks import Detection, ObjectDetector
 from skyloop.vision.tracking import Box, outline
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from skyloop.client.results import Result
 
 
-_SEEN: Final[Colour] = (64, 220, 100)
-_LOST: Final[Colour] = (255, 180, 60)
-_OTHER: Final[Colour] = (150, 150, 150)
 _TRACE_S: Final = 4.0  # duration of the drawn track
 _TRACE_EACH_S: Final = 0.2  # interval between points of the drawn track
 _FEET_M: Final = 0.08  # vertical distance from the feet, from which heights are measured, to the body's centre
@@ -94,7 +91,7 @@ class TargetFollower(AirframeLaw):
         self.finder: TargetFinder | None = None  #: None before the first frame
         self._seen_ns: int | None = None  # capture time of the last frame that showed, or may have shown, the target
         self.sighting = Sighting(None, None)  #: the result of searching the newest frame
-        self._view: Camera | None = None  # camera of the newest frame
+        self._view: CameraPose | None = None  # camera of the newest frame
         self._frame_ns: int | None = None
         self._trace: deque[tuple[int, Array]] = deque()
 
@@ -155,7 +152,7 @@ class TargetFollower(AirframeLaw):
         # If the velocity is unknown, the vehicle is hovering, so use its last known position.
         motion = self.airframe.at(frame.captured_ns) or self.airframe.newest
         if state is None or motion is None:
-            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
+            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), LOST)]
         if frame.intrinsics is None:
             raise UsageError(f"camera {self._camera.name!r} has no intrinsics: calibrate it (skyloop camera calibrate)")
         ground = state.altitude_m is not None
@@ -170,9 +167,9 @@ class TargetFollower(AirframeLaw):
                 state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
         size = (frame.shape[1], frame.shape[0])
         risen_m = None if self._relative else float(motion.position[2])
-        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
+        view = CameraPose.at(self._camera, state, body, frame.intrinsics, size, rates, risen_m)
         if view is None:
-            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
+            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), LOST)]
         if self.finder is None:
             self.finder = TargetFinder(
                 box=self._box,
@@ -249,17 +246,17 @@ class TargetFollower(AirframeLaw):
             return self.problem
         if self.sighting.contested:
             return "a look-alike is at its expected position"
-        return "at the end of the leash" if self._law.held_by else ""
+        return "at the end of the leash" if self._law.constraint else ""
 
     def _drawing(self, captured_ns: int) -> list[Shape]:
         assert self.finder is not None
         view, estimator = self._view, self.finder.estimator
         assert view is not None
         box = self.sighting.box
-        colour = _SEEN if box is not None else _LOST
+        colour = SEEN if box is not None else LOST
         # Detections from a processor are not drawn here, because the processor annotates its frames itself.
         found = () if self._detector is None else self.finder.detections[:16]
-        shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
+        shapes: list[Shape] = [Polyline(one.outline, True, OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
             return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
         state = estimator.at(captured_ns)
@@ -275,7 +272,7 @@ class TargetFollower(AirframeLaw):
         elif self.phase in LOSSES:
             expected = predicted_box(view, state.foot, state.height_m)
             if expected is not None:
-                shapes.append(Polyline(outline(expected), True, _LOST))
+                shapes.append(Polyline(outline(expected), True, LOST))
         middle = view.pixel(state.middle)
         if middle is not None:
             shapes.append(Points((middle,), colour))

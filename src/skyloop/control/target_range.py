@@ -27,7 +27,7 @@ from skyloop.control.target_estimate import (
     SURE_OF_SIZE,
     UNKNOWN,
     BoxView,
-    Camera,
+    CameraPose,
     TargetEstimator,
     TargetState,
     Traits,
@@ -71,11 +71,12 @@ class RangeEstimator(TargetEstimator):
         self._base_m = 0.0  # averaged difference between altimeter and climb [m]
         self._size_known = self._known = self._learns = False
 
-    def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
+    def start(self, view: BoxView, camera: CameraPose, at_ns: int, *, ground: bool) -> None:
         """Start from the first box, as in :meth:`TargetEstimator.start`.
 
-        If the camera's height is unknown, the hypotheses can't be distinguished. In that case the nominal range is
-        used, and the control law keeps the apparent size constant.
+        If the camera's height is unknown, the hypotheses can't be distinguished. There is then only one filter, whose
+        range follows from the target's size or, if that is unknown, is nominal: the control law then keeps the apparent
+        size constant.
         """
         self._size_known = self.traits.height_m is not None and self.traits.height_share < SURE_OF_SIZE
         self._base_m = _off_climb(camera)
@@ -102,14 +103,14 @@ class RangeEstimator(TargetEstimator):
         self._heights.append((at_ns, float(camera.position[2])))
         self._judge(self.at(at_ns))
 
-    def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
+    def distance(self, view: BoxView, camera: CameraPose, at_ns: int) -> tuple[float, float]:
         """Measure how badly a box fits the best hypothesis and the mixture; see :meth:`TargetEstimator.distance`."""
         seen_from = self._seen_from(camera, self._steady(camera))
         fits, costs = zip(*(guess.distance(view, one, at_ns) for guess, one in seen_from), strict=True)
         likelihood = float(self._weights @ np.exp(-np.minimum(costs, 700.0) / 2.0))
         return min(fits), -2.0 * math.log(likelihood) if math.isfinite(min(costs)) and likelihood > 0.0 else math.inf
 
-    def update(self, view: BoxView, camera: Camera, at_ns: int) -> bool:
+    def update(self, view: BoxView, camera: CameraPose, at_ns: int) -> bool:
         """Update with a box, as in :meth:`TargetEstimator.update`, and drop hypotheses that no longer fit.
 
         The filters restart if the measured height jumps, because someone walks below, the vehicle flies over a table,
@@ -182,7 +183,7 @@ class RangeEstimator(TargetEstimator):
             traits, nominal_m=before.range_m, relative=self._relative, before=before if self._known else None
         )
 
-    def _member(self, view: BoxView, camera: Camera, at_ns: int, *, on_ground: bool) -> TargetEstimator:
+    def _member(self, view: BoxView, camera: CameraPose, at_ns: int, *, on_ground: bool) -> TargetEstimator:
         member = TargetEstimator(self.traits, nominal_m=self._nominal_m, relative=self._relative)
         member.start(view, camera, at_ns, ground=on_ground)
         if on_ground and not self._size_known:
@@ -203,18 +204,18 @@ class RangeEstimator(TargetEstimator):
         if self._on_ground not in self._guesses:
             self._on_ground = None
 
-    def _steady(self, camera: Camera) -> Camera:
+    def _steady(self, camera: CameraPose) -> CameraPose:
         """Return the camera with a height derived from the vehicle's own climb."""
         if camera.rise_m is None:
             return camera
         x, y, _ = camera.position
         return replace(camera, position=np.array([x, y, camera.rise_m + self._base_m]))
 
-    def _seen_from(self, camera: Camera, steady: Camera) -> list[tuple[TargetEstimator, Camera]]:
+    def _seen_from(self, camera: CameraPose, steady: CameraPose) -> list[tuple[TargetEstimator, CameraPose]]:
         """Return each hypothesis with its camera; the ground hypothesis uses the altimeter's height."""
         return [(guess, camera if guess is self._on_ground else steady) for guess in self._guesses]
 
-    def _jumps(self, camera: Camera, at_ns: int) -> bool:
+    def _jumps(self, camera: CameraPose, at_ns: int) -> bool:
         """Return whether the height is jumping or has just jumped."""
         height, heights = float(camera.position[2]), self._heights
         while len(heights) > 1 and abs(seconds(at_ns - heights[0][0])) > _JUMPING_S:
@@ -224,7 +225,7 @@ class RangeEstimator(TargetEstimator):
         heights.append((at_ns, height))
         return self._jumped_ns is not None and abs(seconds(at_ns - self._jumped_ns)) < _JUMPING_S
 
-    def _stir(self, camera: Camera, since_s: float) -> float:
+    def _stir(self, camera: CameraPose, since_s: float) -> float:
         """Return the vehicle's distance [m] from its recent position, measured across the initial line of sight."""
         self._about = self._about + (camera.position - self._about) * within(since_s / _OF_LATE_S, 0.0, 1.0)
         x, y, z = (camera.position - self._about).tolist()
@@ -243,7 +244,7 @@ class RangeEstimator(TargetEstimator):
             self._known = share < _UNKNOWN if sure else moved and share < _KNOWN
 
 
-def _off_climb(camera: Camera) -> float:
+def _off_climb(camera: CameraPose) -> float:
     """Return the camera's height minus the vehicle's climb [m]; 0 if the climb is unknown."""
     return 0.0 if camera.rise_m is None else float(camera.position[2]) - camera.rise_m
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, Camera, TargetEstimator, Traits
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, BoxView, CameraPose, TargetEstimator, Traits
 from skyloop.estimation import assignment
 from skyloop.vision.object_tracks import Detection
 
@@ -41,7 +41,7 @@ _APART_S: Final = 0.6  # time after a separation at which velocities are known a
 _DIFFER_M_S: Final = 0.8  # minimum velocity difference before a meeting for telling two objects apart
 _TURNED: Final = 0.3  # the objects count as confused if this fraction of that difference has reversed
 _KEEP_S: Final = 2.0  # time to remember hidden objects; a later newcomer may be a different object
-_YOUNG_S: Final = 0.5  # time to remember hidden objects that were seen only once
+_YOUNG_S: Final = 0.5  # time to remember hidden objects that were never confirmed
 _CONFIRMED: Final = 3  # number of detections needed to confirm an object
 _OF_A_PART: Final = 1.0  # colour difference assumed for objects cut off by the image
 _SETTLED: Final = 8  # number of detections after which an object can contest others; new ones may be two in one
@@ -136,7 +136,7 @@ def _is_about(thing: SceneObject, at_ns: int) -> bool:
     return seen_s < _LATELY_S or (seen_s < _TOGETHER_S and seconds(at_ns - thing.contested_ns) < _LATELY_S)
 
 
-def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: Camera, at_ns: int) -> bool:
+def _is_merged(thing: SceneObject, other: SceneObject, seen: _Seen, camera: CameraPose, at_ns: int) -> bool:
     """Return whether a detection may show two objects, because another object's centre is in it, not far behind."""
     state = other.estimator.at(at_ns)
     middle = camera.pixel(state.middle)
@@ -165,11 +165,12 @@ class Scene:
         self._assign = assignment("matching detections", "detect")
 
     def update(
-        self, detections: Sequence[Detection], looks: Sequence[Floats], camera: Camera, at_ns: int, *, ground: bool
+        self, detections: Sequence[Detection], looks: Sequence[Floats], camera: CameraPose, at_ns: int, *, ground: bool
     ) -> None:
-        """Match the detections in the next image; ``ground``: whether the camera's height above ground is known.
+        """Match the detections in the next image.
 
-        ``looks`` contains the colours for each detection: (6,), or (n, 6) for n strips from left to right.
+        ``looks`` contains the colours of each detection: (6,), or (n, 6) for n strips from left to right. ``ground``
+        states whether the camera's height above the ground is known.
         """
         self._forget(at_ns)
         seen = [
@@ -185,7 +186,7 @@ class Scene:
             if new.detection.score >= _SURE:
                 self._add(new, camera, at_ns, ground=ground)
 
-    def _match(self, seen: list[_Seen], camera: Camera, at_ns: int) -> list[_Seen]:
+    def _match(self, seen: list[_Seen], camera: CameraPose, at_ns: int) -> list[_Seen]:
         """Update the objects that match a detection; return the unmatched detections."""
         things = [each for number, each in self.objects.items() if number not in self.dormant]
         if not things or not seen:
@@ -255,7 +256,7 @@ class Scene:
             if float(np.hypot(*before)) > _DIFFER_M_S and float(after @ before) < -_TURNED * float(before @ before):
                 one.exchange(other)
 
-    def _add(self, new: _Seen, camera: Camera, at_ns: int, *, ground: bool) -> None:
+    def _add(self, new: _Seen, camera: CameraPose, at_ns: int, *, ground: bool) -> None:
         name = new.detection.class_name
         estimator = TargetEstimator(self.traits.get(name, UNKNOWN), relative=self._relative)
         estimator.start(new.view, camera, at_ns, ground=ground)

@@ -44,7 +44,7 @@ class Waypoint:
 
     @property
     def position(self) -> Vector:
-        """Return (x, y, z) [m], world axes."""
+        """The position (x, y, z) in world axes [m]."""
         return self.x, self.y, self.z
 
 
@@ -82,10 +82,10 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
     speed = _approach(away, s.speed_m_s, s)
     share = speed / away if away > 1e-9 else 0.0
     assert feedback.yaw_rad is not None
-    c, si = math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad)
+    forward, left = turned(east, north, -feedback.yaw_rad)
     return Velocity(
-        forward=share * (c * east + si * north),
-        left=share * (c * north - si * east),
+        forward=share * forward,
+        left=share * left,
         up=math.copysign(_approach(abs(up), s.climb_m_s, s), up),
         yaw_rate=clamped(s.yaw_gain * yaw, s.turn_rad_s),
     )
@@ -101,7 +101,7 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 
 
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
-    """Return the difference between the vehicle and the goal: east, north, up [m] and yaw [rad]."""
+    """Return the goal's pose minus the vehicle's: east, north, up [m] and yaw [rad]."""
     problem = lacking(feedback)
     if problem or feedback.position_m is None or feedback.yaw_rad is None:
         raise UsageError(f"can't fly to a waypoint: {problem}")
@@ -135,14 +135,12 @@ PositionSource = Callable[[], Fix | None]
 
 def fix_of(feedback: Feedback) -> Fix | None:
     """Return the position from a vehicle's own feedback, at its capture time; None if position or yaw is unknown."""
-    if feedback.position_m is None or feedback.yaw_rad is None:
+    yaw, velocity = feedback.yaw_rad, feedback.velocity_m_s
+    if feedback.position_m is None or yaw is None:
         return None
-    return Fix(
-        feedback.captured_ns,
-        feedback.position_m,
-        feedback.yaw_rad,
-        _world_velocity(feedback.velocity_m_s, feedback.yaw_rad),
-    )
+    if velocity is not None:
+        velocity = *turned(velocity[0], velocity[1], yaw), velocity[2]
+    return Fix(feedback.captured_ns, feedback.position_m, yaw, velocity)
 
 
 class DeadReckoning:
@@ -162,7 +160,7 @@ class DeadReckoning:
         self._begin = begin
         self._airframe = Airframe()
         self._newest: Fix | None = None
-        self._listener = drone.on_feedback(self._take, inline=True)
+        self._listener = drone.on_feedback(self._add, inline=True)
 
     def __call__(self) -> Fix | None:
         """Return the newest position; None until the vehicle has reported velocity and yaw."""
@@ -172,7 +170,7 @@ class DeadReckoning:
         """Cancel the subscription."""
         self._listener.cancel()
 
-    def _take(self, feedback: Feedback) -> None:
+    def _add(self, feedback: Feedback) -> None:
         self._airframe.add(feedback)
         motion = self._airframe.newest
         if motion is None or motion.at_ns != feedback.captured_ns:
@@ -182,10 +180,3 @@ class DeadReckoning:
         vx, vy, vz = motion.velocity.tolist()
         place = (self._begin[0] + east, self._begin[1] + north, height)
         self._newest = Fix(motion.at_ns, place, motion.yaw, (vx, vy, vz))
-
-
-def _world_velocity(velocity: Vector | None, yaw: float) -> Vector | None:
-    if velocity is None:
-        return None
-    forward, left, up = velocity
-    return *turned(forward, left, yaw), up

@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
 from skyloop.client.channels import Channel, Listener
@@ -22,7 +21,7 @@ from skyloop.motion_capture.source import RawFrame, System
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-LOOK_S: Final = 0.05  #: interval between checks for lost bodies
+CHECK_S: Final = 0.05  #: interval between checks for lost bodies
 EVENT_DEPTH: Final = 256  #: maximum number of events waiting for a slow callback
 MAX_UNKNOWN: Final = 1000  #: maximum number of names to remember for bodies that were not requested
 T = TypeVar("T")
@@ -80,13 +79,13 @@ class MotionCapture:
             UsageError: ``bodies`` is empty or maps two names to one body.
         """
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
-            raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
+            raise UsageError(f'bodies is {bodies!r} and must map names, such as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
             raise UsageError(f"bodies is {bodies!r} and must not map two names to one body")
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
-        self.unknown: set[str] = set()  #: bodies seen by the system but not named in ``bodies``
+        self.unknown: set[str] = set()
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
@@ -99,7 +98,7 @@ class MotionCapture:
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._source = make(system, self._names, self._take, self._trouble)
-        self._watch = threading.Thread(target=self._look_on, name="skyloop-mocap-watch", daemon=True)
+        self._watch = threading.Thread(target=self._watch_tracks, name="skyloop-mocap-watch", daemon=True)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
@@ -127,9 +126,7 @@ class MotionCapture:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     # Reading ---------------------------------------------------------------------------------------------------
@@ -142,7 +139,7 @@ class MotionCapture:
         """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns() - self.latency_ns)  # the watch thread may lag behind
+            track.update(monotonic_ns() - self.latency_ns)  # the watch thread may lag behind
             return track.pose
 
     def state(self, name: str) -> TrackState:
@@ -199,7 +196,7 @@ class MotionCapture:
         The return value and exceptions are the same as for :meth:`on_pose`.
 
         Args:
-            function: A function called on a separate thread, for which up to 256 events can wait.
+            function: A function called on a separate thread; up to 256 events wait for it.
             inline: Whether to call the function on the thread that detected the change instead of a separate one.
         """
         return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
@@ -231,9 +228,7 @@ class MotionCapture:
     # For drones and controllers ---------------------------------------------------------------------------------
 
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
-        """Log a drone's poses in the drone's log, so that they are recorded and shown in the cockpit.
-
-        Loss of tracking is logged too.
+        """Log a drone's poses in the drone's log, for recordings and the cockpit; losses of tracking are logged, too.
 
         Args:
             drone: The drone; its proxy's name must be in ``bodies``.
@@ -336,11 +331,11 @@ class MotionCapture:
             self._troubled = text
             self._publish_event("", TrackState.LOST, text)
 
-    def _look_on(self) -> None:
-        while not self._ended.wait(LOOK_S):
+    def _watch_tracks(self) -> None:
+        while not self._ended.wait(CHECK_S):
             for track in self._tracks.values():
                 with self._changed:
-                    track.look(monotonic_ns() - self.latency_ns)  # age of the poses on arrival
+                    track.update(monotonic_ns() - self.latency_ns)  # age of the poses on arrival
                 self._report(track)
 
     def _report(self, track: Track) -> None:
@@ -373,10 +368,10 @@ def _reported_by_the_log(name: str, error: Exception | SystemExit) -> None:
 
 
 class Linked:
-    """Logs all poses of a drone in that drone's log until closed. See :meth:`MotionCapture.link`."""
+    """Logs a drone's poses in the drone's log until closed. See :meth:`MotionCapture.link`."""
 
     def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
-        """Initialise without logging, which starts with the ``with`` block."""
+        """Initialise; logging starts with the ``with`` block."""
         if not 1.0 <= max_hz <= 1000.0:
             raise UsageError(f"max_hz is {max_hz!r} and must be from 1 to 1000")
         self._capture = capture
@@ -391,9 +386,7 @@ class Linked:
         self._listeners.append(self._capture.on_event(self._event, inline=True))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -1,7 +1,7 @@
 """Poses from a motion capture system: conversion to Skyloop's axes, tracking over time and calibration. Pure.
 
 The calibration is the rotation between a tracked body's axes, as defined by the system, and those of the drone. The
-The procedure is the same as in MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is
+procedure is the same as in MAVwork: the drone rests for two seconds, the poses are averaged, and the calibration is
 refused if they vary too much. The drone's own roll and pitch determine its attitude at rest. Its nose must point along
 the world's x axis unless ``heading`` is given.
 """
@@ -225,7 +225,7 @@ class Track:
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
         """Initialise a body that has not been seen; ``may_freeze`` is for simulators without noise."""
         self.body = body
-        self.state = TrackState.WAITING  #: whether the body is tracked
+        self.state = TrackState.WAITING
         self.pose: BodyPose | None = None  #: the newest pose while the body is tracked, otherwise None
         self._may_freeze = may_freeze
         self._recent: deque[tuple[int, Vector]] = deque()
@@ -251,7 +251,7 @@ class Track:
         self.pose = BodyPose(self.body, captured_ns, position, quaternion, velocity_m_s=self._velocity())
         return self.pose
 
-    def look(self, now_ns: int) -> bool:
+    def update(self, now_ns: int) -> bool:
         """Update the state for a given time [ns]; return whether the body has just been lost."""
         if self.pose is None or now_ns - self.pose.captured_ns < nanoseconds(LOST_AFTER_S):
             return False

@@ -44,9 +44,9 @@ SIM: Final = "sim"
 OPTIONS: Final = {
     "up": "the up axis of the system's data: y or z",
     "latency": "age of a pose on arrival [s], from exposure to here",
-    "interface": "address of the network interface of the system (OptiTrack)",
+    "interface": "address of the network interface that receives the multicast (OptiTrack)",
     "port": "port of the system's command channel (OptiTrack; default 1510)",
-    "sensor": "sensor of trackers whose name in bodies gives none (VRPN): a number from 0",
+    "sensor": "zero-based number of the sensor to use for trackers whose names in bodies specify none (VRPN)",
 }
 
 

@@ -38,6 +38,7 @@ from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import DecodeError, LinkError, UsageError
 from skyloop.motion_capture.source import RawFrame, Seen, System
 
+# The protocol's numbers, from the sources above.
 DEFAULT_PORT: Final = 3883
 COOKIE_SIZE: Final = 24
 COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(COOKIE_SIZE, b"\0")  #: the 0 asks the server not to log
@@ -52,7 +53,7 @@ MAX_NAME: Final = 100  #: maximum size of a name in bytes, including the NUL
 HEADER: Final = struct.Struct(">IIIiiI")
 NAME_LENGTH: Final = struct.Struct(">I")
 POSE: Final = struct.Struct(">ii7d")
-_SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]
+_SAME_MAJOR: Final = COOKIE[: COOKIE.rindex(b".") + 1]  # servers of other major versions speak another protocol
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class TrackerPose:
 class Decoder:
     """Decodes a server's stream, starting with the cookie, from pieces of any size.
 
-    The decoder stores at most one incomplete message and the names described by the server.
+    It stores at most one incomplete message and the names described by the server.
     """
 
     def __init__(self) -> None:
@@ -199,10 +200,10 @@ class SensorSelection:
 
     @property
     def refused(self) -> dict[str, str]:
-        """Return the trackers whose sensor must be specified but isn't, with the reason and a remedy."""
+        """Trackers whose sensor must be specified but isn't, with the reason and a remedy."""
         return {
-            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and the body's is not named: name it "
-            f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
+            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, but which one to use is not specified: "
+            f"name it in bodies, such as {f'{tracker}:{min(sensors)}'!r}, or add ?sensor={min(sensors)} to the address"
             for tracker, (_, sensors) in self._reported.items()
             if sensors != {0}
         }

@@ -18,7 +18,7 @@ class Rank(IntEnum):
     """The order in which samples are dropped, highest rank first."""
 
     KEPT = 0  #: commands, events, parameters, logs: dropped only if the reserve is also full
-    STATE = 1  #: feedback, annotations
+    STATE = 1  #: feedback, annotations, results
     FRAME = 2
 
 

@@ -49,8 +49,8 @@ __all__ = [
     "PosesInFrame",
 ]
 
-LINE_WIDTH: Final = 2.0  # line width in pixels
-FONT_SIZE: Final = 14.0
+LINE_WIDTH: Final = 2.0  # width of the lines of a drawing [px]
+FONT_SIZE: Final = 14.0  # size of its texts [px]
 _LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
 
 

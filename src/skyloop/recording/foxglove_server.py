@@ -47,13 +47,9 @@ class FoxgloveServer:
     def __init__(
         self, drones: Sequence[Drone], *, host: str = "127.0.0.1", port: int = PORT, priority: int | None = None
     ) -> None:
-        """Start listening.
+        """Start listening; port 0 selects a free port.
 
-        Args:
-            drones: Connected drones, with distinct names.
-            host: Address to listen on.
-            port: Port to listen on; 0 selects a free port.
-            priority: Priority used for viewers' parameter writes, from 0 (highest) to 31; None forbids writing.
+        ``priority``, from 0 (highest) to 31, is used for viewers' parameter writes; None forbids writing.
 
         Raises:
             UsageError: Two drones have the same name, or other machines would be able to write parameters.
@@ -306,7 +302,7 @@ def _of_camera(drone: str, camera: CameraInfo, far: bool) -> Iterator[ViewTopic]
 # Access: which web pages may connect, and how viewers read and write parameters ----------------------------------
 
 
-LOOKS_ONLY: Final = "this view is read-only: start it with --write to write parameters"
+READ_ONLY: Final = "this view is read-only: start it with --write to write parameters"
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,11 +325,8 @@ class ParameterAccess:
     ) -> None:
         """Initialise without sending any request.
 
-        Args:
-            drones: Observed drones, with distinct names.
-            priority: Priority used for writes, from 0 (highest) to 31; None forbids writing.
-            on_change: Called with a parameter's name and value on a separate thread: once for each parameter when
-            :meth:`follow` is called, and then after each change.
+        ``priority``, from 0 (highest) to 31, is used for writes; None forbids writing. ``on_change`` is called with a
+        parameter's name and value on a separate thread: once for each when :meth:`follow` is called, and after changes.
         """
         self._drones = {drone.name: drone for drone in drones}
         self._priority = priority
@@ -342,10 +335,7 @@ class ParameterAccess:
         self._following: list[tuple[Parameters, Listener[Event]]] = []
 
     def read(self, names: Iterable[str] = ()) -> dict[str, Value]:
-        """Return the values of the named parameters, or of all. Wait up to 2 s for a drone that does not respond.
-
-        Raise ``SkyloopError`` if a drone does not answer.
-        """
+        """Return the values of the named parameters, or of all; raise ``SkyloopError`` if a drone does not answer."""
         wanted = set(names)
         of = {name.partition("/")[0] for name in wanted} if wanted else self._drones.keys()
         found = {
@@ -373,7 +363,7 @@ class ParameterAccess:
                 return
             for drone in self._drones.values():
                 followed = Parameters(drone, self._reporter(drone.name))
-                self._following.append((followed, drone.on_event(followed.event, inline=True)))
+                self._following.append((followed, drone.on_event(followed.on_event, inline=True)))
                 followed.start()
 
     def close(self) -> None:
@@ -389,7 +379,7 @@ class ParameterAccess:
         drone, key = self._found(name)
         parameter = drone.config.describe(key)
         if self._priority is None:
-            raise ParameterError(LOOKS_ONLY)
+            raise ParameterError(READ_ONLY)
         authority = Authority(priority=self._priority)
         with connect(drone.name, authority=authority, name="skyloop view", on_exit="hover") as writer:
             writer.config[key] = _typed(parameter, value)
@@ -422,7 +412,7 @@ def _typed(parameter: Parameter, value: object) -> object:
 
 MAX_HEAD: Final = 16_384  #: maximum size of a request's head [bytes]
 HEAD_S: Final = 5.0  #: time limit for receiving a request's head
-_CHUNK: Final = 1 << 16
+_CHUNK: Final = 1 << 16  # maximum number of bytes to receive at once
 _ORIGIN: Final = re.compile(rb"^origin[ \t]*:[ \t]*(.*?)[ \t]*\r?$", re.IGNORECASE | re.MULTILINE)
 _FOXGLOVE: Final = "foxglove.dev"
 _REFUSED: Final = (
@@ -450,12 +440,10 @@ def hidden_host() -> str:
 
 
 class OriginGuard:
-    """Listens until :meth:`close` is called, and forwards connections from trusted origins to the server.
-
-    ``port``: port to listen on; 0 selects a free one. Raise ``OSError`` if listening on the address failed.
-    """
+    """Listens until :meth:`close` is called, and forwards connections from trusted origins to the server."""
 
     def __init__(self, host: str, port: int) -> None:
+        """Start listening; port 0 selects a free one. Raise ``OSError`` if listening on the address failed."""
         guard = self
 
         class Visitor(socketserver.BaseRequestHandler):
@@ -492,6 +480,7 @@ class OriginGuard:
             if not (more := visitor.recv(_CHUNK)):
                 return
             head += more
+        # Browsers always name the page's origin when opening a WebSocket (RFC 6455, section 4.1); programs need not.
         origins = _ORIGIN.findall(head.partition(b"\r\n\r\n")[0])
         if len(head) >= MAX_HEAD or not all(is_trusted(origin.decode("latin-1")) for origin in origins):
             visitor.sendall(_REFUSED)

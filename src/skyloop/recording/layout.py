@@ -118,7 +118,7 @@ class Start(msgspec.Struct, frozen=True):
 class End(msgspec.Struct, frozen=True):
     """Metadata ``skyloop.end``, written at the end of a closed file. Losses are counted from the recording's start."""
 
-    reason: str  #: ``closed``, or ``rotated`` if another file follows
+    reason: str  #: ``closed``, or ``rotated`` if another file may follow
     ended_unix_ns: int
     written: dict[str, int]  #: number of messages in *this file*, by topic
     dropped: dict[str, dict[str, int]] = {}  #: samples received but dropped, by drone and channel
@@ -239,12 +239,12 @@ def parse_topic(topic: str) -> Topic | None:
 
 
 def image_topic(drone: str, camera: str) -> str:
-    """Return the topic for a camera's images (foxglove.CompressedImage)."""
+    """Return the topic of a camera's images, foxglove.CompressedImage."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
 
 
 def video_topic(drone: str, camera: str) -> str:
-    """Return the topic of a camera's H.264 as sent by the vehicle, foxglove.CompressedVideo."""
+    """Return the topic of a camera's H.264, foxglove.CompressedVideo."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/video"
 
 

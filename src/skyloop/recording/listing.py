@@ -24,7 +24,7 @@ class Described(msgspec.Struct, frozen=True):
 
 
 def shown_name(path: Path) -> str:
-    """Return a file's name as text, with bytes that are not UTF-8 in hexadecimal."""
+    """Return a file's name as text, with non-UTF-8 bytes shown in hexadecimal."""
     return os.fsencode(path.name).decode(errors="backslashreplace")
 
 

@@ -20,7 +20,7 @@ from skyloop.recording.layout import Channel
 VideoEncoding = Literal["auto", "jpeg", "png"]
 
 _FORBIDDEN: Final = re.compile(r'[<>:"/\\|?*]')  # in the names of files; Windows has the longest list
-MB: Final = 1_000_000
+MB: Final = 1_000_000  #: [bytes]
 VIDEO: Final = "video"
 #: Channels to choose from; ``video.CAMERA`` selects one camera.
 CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, Channel.DROPS)), VIDEO)
@@ -133,7 +133,8 @@ class RecorderState(StrEnum):
     RECORDING = "recording"
     PAUSED = "paused"  #: the disk can't be written to; essential samples wait, and the write is retried every second
     CLOSED = "closed"  #: closed intentionally; the file is complete
-    FAILED = "failed"  #: its process was killed, or an error ended its thread; data already written remains in the file
+    #: its process was killed, an error ended its thread, or it was closed while paused; data already written remains
+    FAILED = "failed"
 
 
 class Status(msgspec.Struct, frozen=True):

@@ -169,11 +169,9 @@ class Group:
         self._image: Any = None  # the most recently decoded image
 
     def __len__(self) -> int:
-        """Return the number of frames."""
         return len(self._units)
 
     def add(self, unit: bytes) -> None:
-        """Append a frame's access unit."""
         self._units.append(unit)
 
     def pixels(self, index: int, what: str) -> NDArray[np.uint8]:

@@ -33,7 +33,7 @@ from skyloop.messages import (
 T = TypeVar("T")
 
 MAX_DEPTH: Final = 64  #: maximum nesting of lists and objects in a sample; processors' results use a few levels
-MIN_INT: Final = -(1 << 63)
+MIN_INT: Final = -(1 << 63)  #: the range of 64-bit integers
 MAX_INT: Final = (1 << 63) - 1
 
 
@@ -306,7 +306,10 @@ _TIMES: Final = ("captured_ns", "published_ns", "applied_ns", "sent_ns", "at_ns"
 
 
 def reported_ns(value: Any) -> int | None:
-    """Return the time at which the proxy received or published a sample, or None if the sample has no time."""
+    """Return a sample's time on the proxy's clock, or None if the sample has no time.
+
+    It is the time of reception or publication where the sample states it, and of capture or completion otherwise.
+    """
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
     if isinstance(value, Applied):
@@ -359,8 +362,9 @@ class Course:
             self.first_ns = self.newest_ns = own_ns
         elif -_BACK_NS < own_ns - self.newest_ns < _AHEAD_NS:
             self.newest_ns = max(self.newest_ns, own_ns)
+            # Only feedback dispels a doubt, or shows that a clock was set back: applications set other samples' times.
             self._doubted_ns = None if isinstance(value, Feedback) else self._doubted_ns
-        elif own_ns > self.newest_ns or isinstance(value, Feedback):  # applications may set the times of other samples
+        elif own_ns > self.newest_ns or isinstance(value, Feedback):
             agree = self._doubted_ns is not None and abs(own_ns - self._doubted_ns) < _BACK_NS
             self._doubted_ns = own_ns
             if agree and own_ns < self.newest_ns:

@@ -1,4 +1,4 @@
-"""Read a recording: its drones, and their samples in order of reception."""
+"""Read a recording: its drones, and their samples in the order they were received."""
 
 from __future__ import annotations
 
@@ -184,7 +184,7 @@ class Recording:
 
         Args:
             topics: Topics to yield, or None to yield all topics.
-            from_ns: Log time at which to start, Unix time [ns].
+            from_ns: Log time to start from, Unix time [ns].
             progress: Called with the fraction read so far, 0 to 1.
 
         Raises:

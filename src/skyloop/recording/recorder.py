@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 import msgspec
@@ -22,7 +21,6 @@ from skyloop.client.channels import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.extend import Known
 from skyloop.messages import EventKind, Severity
-from skyloop.platform import lower_priority
 from skyloop.recording.backlog import Backlog
 from skyloop.recording.layout import ClockPair, DroneRecord, to_plain
 from skyloop.recording.options import (
@@ -35,7 +33,7 @@ from skyloop.recording.options import (
     channels_of,
     first_path,
 )
-from skyloop.recording.taps import Tap, check_names
+from skyloop.recording.taps import Tap, check_names, give_way
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 
@@ -97,7 +95,7 @@ class Engine:
 
     def forked(self) -> None:
         """Leave the file to the parent process. Called in a child created by ``os.fork``."""
-        self._ended_ns = time.monotonic_ns()
+        self._ended_ns = time.monotonic_ns()  # so that stop() does nothing
 
     def stop(self, timeout_s: float = 10.0) -> None:
         """Write all received samples and close the file. Idempotent."""
@@ -175,12 +173,12 @@ class Recorder:
         self._own: list[Drone] = []  # drones connected by this recorder
         self._backend: Engine | RecorderProcess
         if in_process:
-            self._backend = self._within(drones, path, options)
+            self._backend = self._start_engine(drones, path, options)
         else:
             targets = tuple(drone if isinstance(drone, str) else str(Known(drone).reach) for drone in drones)
-            self._backend = RecorderProcess(Order(targets, str(path.absolute()), options), self._on_event)
+            self._backend = RecorderProcess(ChildArguments(targets, str(path.absolute()), options), self._on_event)
 
-    def _within(self, drones: Sequence[Drone | str], path: Path, options: Options) -> Engine:
+    def _start_engine(self, drones: Sequence[Drone | str], path: Path, options: Options) -> Engine:
         try:
             known = []
             for drone in drones:
@@ -207,7 +205,7 @@ class Recorder:
 
     @property
     def reason(self) -> str:
-        """The reason why recording is paused or has failed."""
+        """The reason why recording is paused, has failed or is leaving out frames."""
         return self.status.reason
 
     @property
@@ -248,9 +246,7 @@ class Recorder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __repr__(self) -> str:
@@ -285,18 +281,18 @@ def record(
         drones: Connected drones, or names of running proxies.
         path: A file, or a folder in which to create a file with a generated name.
         channels: Any of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
-        ``video`` and ``video.CAMERA``; None to record everything.
+            ``video`` and ``video.CAMERA``; None to record everything.
         encoding: Encoding of raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG stay JPEG.
             ``"auto"`` keeps the vehicle's H.264 if it sends H.264, and otherwise encodes frames as JPEG.
         quality: JPEG quality, 1 to 100 (best).
         rotate_mb: Start a new file (``flight-0001.mcap``, …) after this many megabytes; with H.264, at the next key
-            frame. Each file is self-contained. None never does.
+            frame. Each file is self-contained. None means never.
         rotate_s: Start a new file after this many seconds; None means never.
         min_free_mb: Free space to leave on the disk. Below this, no frames are recorded; below a quarter, nothing.
         buffer_mb: Amount of data held for a slow disk before frames are dropped.
         overwrite: Whether to replace an existing file.
         in_process: Whether to record on threads of this process instead of in a separate process. If None, threads are
-        used only if a drone can't be reached from another process.
+            used only if a drone can't be reached from another process.
 
     Raises:
         UsageError: An argument is invalid, or the file already exists or can't be written.
@@ -332,14 +328,13 @@ def record(
 
 START_S: Final = 20.0  #: time allowed for the child to start recording
 _END_S: Final = 15.0  # time allowed to write received samples before the child is terminated
-_HARDER_S: Final = 3.0  # time from terminating the child to killing it
-_TELL_S: Final = 0.25  # interval between the child's status reports
-_NICE: Final = 5  # niceness of the child, so that flying takes precedence
+_KILL_AFTER_S: Final = 3.0  # time from terminating the child to killing it
+_REPORT_S: Final = 0.25  # interval between the child's status reports
 _log = logging.getLogger(__name__)
 
 
-class Order(msgspec.Struct, frozen=True):
-    """The parameters passed to a recording child."""
+class ChildArguments(msgspec.Struct, frozen=True):
+    """The arguments of a recording child."""
 
     targets: tuple[str, ...]  #: address or name of each drone
     path: str
@@ -358,18 +353,18 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
 # The child -----------------------------------------------------------------------------------------------------
 
 
-def run_child(order: Order) -> int:
+def run_child(arguments: ChildArguments) -> int:
     """Record until standard input ends or SIGTERM arrives; return the exit code: 2 if it could not start, else 0."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     on_parent_end(stop.set)
-    lower_priority(_NICE)
+    give_way()
     # Events are sent on this thread, so that a parent that does not read never blocks the writing thread.
     events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:
         try:
-            drones = [stack.enter_context(connect(t, access="observe", name="recorder")) for t in order.targets]
-            engine = Engine(drones, Path(order.path), order.options, events.append)
+            drones = [stack.enter_context(connect(t, access="observe", name="recorder")) for t in arguments.targets]
+            engine = Engine(drones, Path(arguments.path), arguments.options, events.append)
             engine.start()
         except SkyloopError as error:
             _print(Line(trouble=str(error), usage=isinstance(error, UsageError)))
@@ -377,7 +372,7 @@ def run_child(order: Order) -> int:
         stack.callback(engine.stop)
         while not stop.is_set():
             _report(engine, events)
-            stop.wait(_TELL_S)
+            stop.wait(_REPORT_S)
         engine.stop()
         _report(engine, events)
     return 0
@@ -401,18 +396,18 @@ def _print(line: Line) -> None:
 class RecorderProcess:
     """A child process that records. It ends on :meth:`stop`, or when this process ends for any reason."""
 
-    def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
+    def __init__(self, arguments: ChildArguments, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
         """Start the child and wait until it is recording. ``on_event`` is called on the thread that reads its events.
 
         Raise ``UsageError`` if the child can't record because an argument is invalid, ``LinkError`` if the child can't
         record for another reason or has ended, and ``NoAnswerError`` if the child does not start in time.
         """
         self._on_event = on_event
-        self._status = Status(path=order.path)
+        self._status = Status(path=arguments.path)
         self._trouble: Line | None = None
-        self._bell = Notifier()
+        self._notifier = Notifier()
         self._ended = False
-        self._process = ChildProcess([sys.executable, "-m", __name__, msgspec.json.encode(order).decode()])
+        self._process = ChildProcess([sys.executable, "-m", __name__, msgspec.json.encode(arguments).decode()])
         self._thread = threading.Thread(target=self._listen, name="skyloop-recorder", daemon=True)
         self._thread.start()
         try:
@@ -432,11 +427,11 @@ class RecorderProcess:
         return self._status
 
     def stop(self) -> None:
-        """Have the child write all received samples and close its file, then wait for it to end. Idempotent.
+        """Have the child write all received samples and close its file, and wait for its end. Idempotent.
 
-        If a child does not end in time, it is terminated, then killed.
+        If the child does not end in time, it is terminated, then killed.
         """
-        self._process.end(_END_S, _HARDER_S)
+        self._process.end(_END_S, _KILL_AFTER_S)
         self._thread.join()
         self._process.close()
 
@@ -444,7 +439,7 @@ class RecorderProcess:
         def decided() -> bool:
             return self._ended or self._status.state is not RecorderState.STARTING
 
-        if not self._bell.wait_for(decided, START_S):
+        if not self._notifier.wait_for(decided, START_S):
             raise NoAnswerError(f"the recorder's process did not start within {START_S:g} s")
         if self._trouble is not None:
             raise (UsageError if self._trouble.usage else LinkError)(self._trouble.trouble)
@@ -454,10 +449,10 @@ class RecorderProcess:
     def _listen(self) -> None:
         for text in self._process.stdout:
             try:
-                self._take(msgspec.json.decode(text, type=Line))
+                self._handle(msgspec.json.decode(text, type=Line))
             except Exception as error:  # noqa: BLE001 (a library may print anything, and a callback may raise anything)
                 _log.warning("the recorder's process: %r: %r", text[:200], error)
-            self._bell.notify()
+            self._notifier.notify()
         self._process.wait()
         self._ended = True
         if self._trouble is None and self._status.state not in (RecorderState.CLOSED, RecorderState.FAILED):
@@ -465,9 +460,9 @@ class RecorderProcess:
             self._status = msgspec.structs.replace(self._status, state=RecorderState.FAILED, reason=reason)
             with contextlib.suppress(Exception):
                 self._on_event(RecorderEvent(f"{reason}; its data is in {self._status.path}", Severity.ERROR))
-        self._bell.notify()
+        self._notifier.notify()
 
-    def _take(self, line: Line) -> None:
+    def _handle(self, line: Line) -> None:
         if line.status is not None:
             self._status = line.status
         if line.event is not None:
@@ -489,4 +484,4 @@ def check_installed() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_child(msgspec.json.decode(sys.argv[1], type=Order)))
+    sys.exit(run_child(msgspec.json.decode(sys.argv[1], type=ChildArguments)))

@@ -1,4 +1,4 @@
-"""Show drones in Rerun, in a viewer that is started or already running, or in a file; export a recording to a file.
+"""Show drones in Rerun's viewer, started here or already running, or in a file for it; export recordings to such files.
 
 Samples become entities on the timeline ``capture`` (Unix time):
 
@@ -65,9 +65,9 @@ PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
 _AHEAD: Final = 8 * MB  #: maximum number of bytes not yet accepted by the viewer
 _PATIENCE_S: Final = 0.5  # time to wait for a slow viewer before dropping samples
-_ASK_NS: Final = nanoseconds(1.0)  # interval between checks whether the viewer keeps up
-_LAST_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
-_LOOK_S: Final = 0.1  # interval between checks whether the viewer is listening
+_CHECK_NS: Final = nanoseconds(1.0)  # interval between checks whether the viewer keeps up
+_FINISH_S: Final = 5.0  # time allowed for the viewer to accept the remaining data at the end
+_POLL_S: Final = 0.1  # interval between checks whether the viewer is listening
 _SETTLED_S: Final = 1.0  # time for which the viewer must keep listening to count as started
 _SHOWN: Final = ("feedback", "commands", "events", "annotations", "logs")
 _log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ class RerunViewer:
         Args:
             drones: Connected drones, with distinct names.
             host: Address on which a viewer started here listens.
-            port: Port of the viewer. If a viewer already listens there, it is used. None: 9876; 0: any free port.
+            port: Port of the viewer: 9876 by default, 0 for any free one. A viewer that already listens there is used.
             connect: Address of a running viewer to use instead of starting one.
             save: File to write instead of using a viewer.
 
@@ -130,7 +130,7 @@ class RerunViewer:
         return self._channels
 
     def show(self, item: Item) -> None:
-        """Draw a sample, unless the viewer hangs, because Rerun would queue all samples in memory."""
+        """Draw a sample; drop it if the viewer hangs, because Rerun would queue all samples in memory."""
         if not self._keeps_up(item):
             self.left_out += 1
             return
@@ -143,7 +143,7 @@ class RerunViewer:
     def close(self) -> None:
         """Finish the file. The viewer stays open."""
         try:
-            self._shown.close(_PATIENCE_S if self._stalled else _LAST_S)
+            self._shown.close(_PATIENCE_S if self._stalled else _FINISH_S)
         except SkyloopError as error:
             _log.warning("%s", error)
 
@@ -151,13 +151,13 @@ class RerunViewer:
         now_ns = time.monotonic_ns()
         self._ahead += item.size
         if now_ns < self._due_ns and (self._stalled or self._ahead < _AHEAD):
-            return not self._stalled
+            return not self._stalled  # as of the last check
         taken = self._shown.taken(_PATIENCE_S)
         if taken == self._stalled:
             self._stalled = not taken
-            _log.warning("Rerun's viewer %s", "accepts data again" if taken else "hangs or is closed: it takes no data")
+            _log.warning("Rerun's viewer %s", "accepts data again" if taken else "hangs or is closed")
         self._ahead = 0
-        self._due_ns = now_ns + _ASK_NS
+        self._due_ns = now_ns + _CHECK_NS
         return taken
 
     def _decodable(self, item: Item, record: FrameRecord) -> bool:
@@ -192,8 +192,8 @@ def _start(host: str, port: int) -> None:
         if time.monotonic() > end:
             end_session(viewer)  # the viewer is a child of the process that was started here
             raise NoAnswerError(f"Rerun's viewer is not listening on {host}:{port} after {_START_S:g} s")
-        time.sleep(_LOOK_S)
-        listening_s = listening_s + _LOOK_S if _listens(host, port) else 0.0
+        time.sleep(_POLL_S)
+        listening_s = listening_s + _POLL_S if _listens(host, port) else 0.0
 
 
 def _listens(host: str, port: int) -> bool:
@@ -236,13 +236,7 @@ class Exported:
 def export_rrd(
     recording: Recording, path: Path, *, drone: str | None = None, progress: Progress | None = None
 ) -> Exported:
-    """Export a recording to a file for Rerun.
-
-    Args:
-        recording: The recording.
-        path: The file to write; an existing file is replaced.
-        drone: The name of the drone to export, or None to export all drones.
-        progress: Called with the fraction read so far, 0 to 1.
+    """Export one drone of a recording, or all of them, to a file for Rerun; an existing file is replaced.
 
     Raises:
         UnknownNameError: The recording has no such drone.
@@ -384,7 +378,7 @@ class RerunLog:
             for camera in drone.capabilities.cameras
         ]
         plots = [
-            views.TimeSeriesView(origin=f"plots/{part(drone.name)}/{plot}", name=f"{drone.name} {plot}")
+            views.TimeSeriesView(origin=f"plots/{quoted(drone.name)}/{plot}", name=f"{drone.name} {plot}")
             for drone in self._shown
             for plot in (*_STATE, "set_points")
         ]
@@ -411,7 +405,7 @@ class _Drone:
         self._rr = rr
         self._stream = stream
         self._drone = drone.name
-        self._name = part(drone.name)
+        self._name = quoted(drone.name)
         self._unix = drone.unix
         self._cameras = {camera.name: camera for camera in drone.capabilities.cameras}
         self._lenses: dict[str, tuple[int, int, Intrinsics]] = {}
@@ -510,15 +504,15 @@ class _Drone:
         self._at(entry.at_ns)
         if entry.text is not None:
             self._text(f"{entry.name}: {entry.text}" if entry.name else entry.text, entry.severity)
-        elif entry.number is not None and _within(self._series, entry.name):
-            self._plot(f"logs/{part(entry.name)}", (entry.name,), (entry.number,))
+        elif entry.number is not None and _admits(self._series, entry.name):
+            self._plot(f"logs/{quoted(entry.name)}", (entry.name,), (entry.number,))
 
     def _annotation(self, annotation: Annotation) -> None:
-        if annotation.camera not in self._cameras or not _within(self._sources, (annotation.camera, annotation.source)):
+        if annotation.camera not in self._cameras or not _admits(self._sources, (annotation.camera, annotation.source)):
             return
         rr = self._rr
         self._at(annotation.captured_ns)
-        entity = f"{self._entity(annotation.camera)}/drawn/{part(annotation.source)}"
+        entity = f"{self._entity(annotation.camera)}/drawn/{quoted(annotation.source)}"
         lines = [shape for shape in annotation.shapes if isinstance(shape, Polyline) and shape.points]
         spots = [shape for shape in annotation.shapes if isinstance(shape, Points)]
         texts = [shape for shape in annotation.shapes if isinstance(shape, Text)]
@@ -563,15 +557,15 @@ class _Drone:
 
     def _entity(self, camera: str) -> str:
         info = self._cameras.get(camera)
-        return f"cameras/{part(self._drone)}/{part(camera)}" if info is None else entity_of(self._drone, info)
+        return f"cameras/{quoted(self._drone)}/{quoted(camera)}" if info is None else entity_of(self._drone, info)
 
 
 def entity_of(drone: str, camera: CameraInfo) -> str:
     """Return a camera's entity, which is placed in the world if the camera's mounting is known."""
-    return f"{'cameras' if camera.rotation is None else 'world/drones'}/{part(drone)}/{part(camera.name)}"
+    return f"{'cameras' if camera.rotation is None else 'world/drones'}/{quoted(drone)}/{quoted(camera.name)}"
 
 
-def part(name: str) -> str:
+def quoted(name: str) -> str:
     """Quote a name so that it can be part of an entity path."""
     return str(rerun_sdk().escape_entity_path_part(name))
 
@@ -585,7 +579,7 @@ def rerun_sdk() -> Any:
     return rerun
 
 
-def _within(known: set[Any], name: Any) -> bool:
+def _admits(known: set[Any], name: Any) -> bool:
     """Return whether to create an entity for an application's name; the number of such names is limited."""
     if name not in known and len(known) < _MOST_SERIES:
         known.add(name)

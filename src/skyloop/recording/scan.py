@@ -149,7 +149,7 @@ def has_room(found: Scan, size: int) -> bool:
 
 
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Yield the schemas, channels and messages of a piece in file order; add what can't be read to ``damaged``."""
+    """Yield the schemas, channels and messages of a piece in file order; report what can't be read to ``damaged``."""
     try:
         if piece.size > MAX_CHUNK:
             raise ValueError(f"a part of {piece.size} bytes, but at most {MAX_CHUNK} are read at once")
@@ -289,7 +289,8 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
 def _unpack(piece: Piece, data: bytes) -> bytes:
     """Decompress a chunk's records; if the chunk is truncated, recover as many as its compression format allows.
 
-    Decompress at most as much as the chunk announces, and nothing if it announces too much.
+    Nothing is decompressed if the chunk announces too much, and otherwise at most one byte more than it announces, to
+    notice an excess.
     """
     size = piece.unpacked
     if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
@@ -350,7 +351,7 @@ def _parse(data: bytes, most: int) -> Iterator[Record]:
             yield Schema.read(ReadDataStream(BytesIO(data[begin:at])))
 
 
-# By the index ---------------------------------------------------------------------------------------------------
+# The index ------------------------------------------------------------------------------------------------------
 #
 # Opens a file without reading all of its records. The index is trusted only if it accounts for every byte of the file,
 # in which case it must agree with scan(). The footer holds the offset and checksum of the summary, which lists the

@@ -111,13 +111,13 @@ class Tap:
             if wants(channel):
                 self._listeners.append(subscribe(sink, inline=True))
         if self._parameters is not None:
-            self._listeners.append(drone.on_event(self._parameters.event, inline=True))
+            self._listeners.append(drone.on_event(self._parameters.on_event, inline=True))
             self._parameters.start()
         for video in self._videos:
             video.start()
 
     def stop(self) -> None:
-        """Unsubscribe. When this call returns, all received samples are in the backlog."""
+        """Unsubscribe. Afterwards, the backlog holds all received samples except frames that were not yet encoded."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
@@ -142,7 +142,7 @@ class Tap:
         return {channel: missed for channel, missed in found.items() if missed}
 
     def check_streams(self) -> None:
-        """Check every second whether the vehicle's own encoding is still arriving."""
+        """Check whether the vehicle's own encoding is still arriving. Called every second."""
         for video in self._videos:
             video.check_stream(time.monotonic_ns())
 
@@ -157,7 +157,6 @@ class Tap:
         self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
     def put_parameter(self, parameter: Parameter) -> None:
-        """Add a parameter to the backlog."""
         self._put(Channel.PARAMETERS.value, Rank.KEPT, parameter, _SIZE)
 
     # On the receiving thread -----------------------------------------------------------------------------------
@@ -190,7 +189,7 @@ class Tap:
 
 
 class Stream:
-    """One camera's frames as encoded by the vehicle, or encoded for a subscriber, starting at the first key frame."""
+    """One camera's H.264 as sent by the vehicle, or as the proxy encodes it for a subscriber, from a key frame on."""
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, subscriber: str = "") -> None:
         self.gaps = Gaps()
@@ -272,7 +271,7 @@ class Video:
             self._listen(True)
 
     def stop(self) -> None:
-        """Unsubscribe, and end the thread of the encoder."""
+        """Unsubscribe and end the encoder's thread."""
         if self._stream is not None:
             self._stream.stop()
         self._listen(False)
@@ -362,7 +361,7 @@ def encoder(options: Options) -> Encode:
 
 
 class Parameters:
-    """Records all parameters at the start, then each change, on a separate thread."""
+    """Passes all parameters to ``put`` at the start, then each change, on a separate thread."""
 
     def __init__(self, drone: Drone, put: Callable[[Parameter], None]) -> None:
         self._drone = drone
@@ -377,14 +376,13 @@ class Parameters:
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop the thread."""
         self._ended = True
         self._wake.set()
         if self._thread.ident is not None:  # start() may have failed before starting the thread
             self._thread.join()
 
-    def event(self, event: Event) -> None:
-        """Read the parameters again after a parameter was written or a link was restored."""
+    def on_event(self, event: Event) -> None:
+        """Read the parameters again after one of them or the vehicle's link changed, or our own link was restored."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._wake.set()
@@ -421,8 +419,8 @@ _BATCH: Final = MB  # number of bytes to show before the screen is asked again w
 _LIMIT: Final = 16 * MB  # maximum number of bytes held for a slow screen; older images are useless to a viewer
 _RESERVE: Final = 16 * MB  # additional bytes held for samples that must not be dropped
 _QUALITY: Final = 80  # JPEG quality: these images are only viewed, not stored
-_LOOK_NS: Final = nanoseconds(1.0)  # interval between checks of the video streams
-NICENESS: Final = 5
+_CHECK_NS: Final = nanoseconds(1.0)  # interval between checks of the video streams
+NICENESS: Final = 5  #: niceness of processes that record or show drones
 
 #: The index of a drone, and a channel named as in :data:`skyloop.recording.options.CHOICES`, or ``video.CAMERA``.
 Source = tuple[int, str]
@@ -455,7 +453,7 @@ class View:
         self._screen = screen
         self._backlog = Backlog(_LIMIT, _RESERVE)
         self._taps: dict[Source, Tap] = {}
-        self._look_due_ns = 0
+        self._check_due_ns = 0
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-view", daemon=True)
 
@@ -486,7 +484,7 @@ class View:
 
     @property
     def dropped(self) -> int:
-        """Samples dropped because the screen or the encoder was too slow. Safe to read from any thread."""
+        """Samples dropped because the screen was too slow. Safe to read from any thread."""
         return sum(tuple(self._backlog.dropped.values()))
 
     # The thread ------------------------------------------------------------------------------------------------
@@ -512,8 +510,8 @@ class View:
                 self.failed += 1
                 self.failed_why = f"{item.channel}: {error!r:.200}"
                 _log.warning("a sample of %s can't be shown: %r", item.channel, error)
-        if now_ns >= self._look_due_ns:
-            self._look_due_ns = now_ns + _LOOK_NS
+        if now_ns >= self._check_due_ns:
+            self._check_due_ns = now_ns + _CHECK_NS
             for tap in self._taps.values():
                 tap.check_streams()
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
 
 _SEQUENCES: Final = 1 << 32  # number of MCAP's sequence numbers, which have 32 bits
-_PLACES: Final = 400  #: maximum number of points in a path; when it is exceeded, every second one is removed
+_PLACES: Final = 400  # maximum number of points in a path; when it is exceeded, every second one is removed
 _PATH_EVERY_NS: Final = 1_000_000_000  # interval between messages that hold a path
 
 
@@ -83,7 +83,7 @@ class Path:
         self._count = 0
 
     def add(self, place: Any) -> None:
-        """Append a point; skip it if it is too close to the previous point."""
+        """Append a point, or skip it: of a path that had to be thinned, only every second, fourth, … point is kept."""
         if self._count % self._step == 0:
             self.places.append(place)
             if len(self.places) > _PLACES:

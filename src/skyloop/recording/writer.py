@@ -33,9 +33,9 @@ _REOPEN: Final = 4 * MB  #: free bytes required before a new file is opened on a
 #: How long to keep writing to a full file until a key frame arrives: cameras not on drones send one about every 10 s.
 _KEY_WAIT_NS: Final = nanoseconds(15.0)
 _SILENCE_NS: Final = nanoseconds(2.0)  #: after this time without H.264, a full file does not wait for a key frame
-_LOOK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk space, and between attempts to resume writing
+_CHECK_NS: Final = nanoseconds(1.0)  #: interval between checks of the disk space, and between attempts to resume
 
-Tell = Callable[[str, Severity], None]
+Report = Callable[[str, Severity], None]
 _log = logging.getLogger(__name__)
 
 
@@ -107,10 +107,7 @@ class RecordingFile:
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
-        """``clock`` relates monotonic time to Unix time.
-
-        Raise ``OSError`` if the file can't be created or written.
-        """
+        """Create the file. ``clock`` relates monotonic time to Unix time."""
         try:
             from mcap.writer import CompressionType, Writer
         except ImportError as error:
@@ -203,20 +200,23 @@ class FileWriter:
         drones: Sequence[DroneRecord],
         translators: Sequence[Translator],
         clock: ClockPair,
-        tell: Tell,
+        report: Report,
         *,
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
-        """Initialise without opening a file. ``tell`` is called on the writing thread or, at first, :meth:`start`'s."""
+        """Initialise without opening a file.
+
+        ``report`` is called on the writing thread and, for the first file, on the thread that calls :meth:`start`.
+        """
         self.state = RecorderState.STARTING  #: state of the recorder
         self.reason = ""  #: reason why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
         self.room = Room.ALL  #: which samples to write, depending on the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last sample that could not be written
-        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: returns the totals at the end of each file
-        #: function that returns the totals of missed samples by drone and channel, for the end of each file
+        #: functions that return the totals of dropped and missed samples, by drone and channel
+        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
         self.each_second: Callable[[], None] = lambda: None  #: called every second on the writing thread
         self._path = path
@@ -224,7 +224,7 @@ class FileWriter:
         self._backlog = backlog
         self._translators = translators
         self._clock = clock
-        self._report = tell
+        self._report = report
         self._opener = opener
         self._free = free
         self._floor = round(options.min_free_mb * MB)
@@ -235,7 +235,7 @@ class FileWriter:
         self._uncommitted: list[Item] = []
         self._closed_bytes = self._closed_messages = 0
         self._now_ns = clock.monotonic_ns
-        self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
+        self._opened_ns = self._commit_due_ns = self._check_due_ns = 0
         self._due_ns = 0  # time at which a new file became due
         self._chains: dict[tuple[int, str], Chain] = {}  # H.264 chains in this file, by drone and channel
         self._encoded_ns = 0  # time of the last H.264 frame written
@@ -280,13 +280,13 @@ class FileWriter:
 
     @property
     def bytes(self) -> int:
-        """Bytes written so far, in all files."""
+        """Bytes written so far to all files, including waiting data."""
         file = self._file
         return self._closed_bytes + (0 if file is None else file.size)
 
     @property
     def messages(self) -> int:
-        """Messages written so far, in all files."""
+        """Messages written so far to all files."""
         file = self._file
         return self._closed_messages + (0 if file is None else file.count)
 
@@ -301,7 +301,7 @@ class FileWriter:
     def _work(self) -> None:
         for _ in beats(BEAT_S, self._closing):
             self.step(time.monotonic_ns())
-        self._look_due_ns = 0  # makes a paused recording try once more, and writes the final counts
+        self._check_due_ns = 0  # makes a paused recording try once more, and writes the final counts
         self.step(time.monotonic_ns())
         self._end()
 
@@ -322,8 +322,8 @@ class FileWriter:
         """Do the work that is due at the given time [ns, monotonic]. Called by the writing thread, or by a test."""
         self._now_ns = now_ns
         try:
-            if now_ns >= self._look_due_ns:
-                self._look_due_ns = now_ns + _LOOK_NS
+            if now_ns >= self._check_due_ns:
+                self._check_due_ns = now_ns + _CHECK_NS
                 self._check_disk()
                 self.each_second()
             if self._file is not None:
@@ -333,7 +333,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate and write all waiting samples, committing data along the way."""
+        """Translate and write all waiting samples, committing when due; start a new file, if due, at a key frame."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
@@ -514,6 +514,6 @@ def _is_key(item: Item) -> bool:
 
 
 def _why(error: OSError) -> str:
-    """Describe an error in words that users can understand."""
+    """Describe an error to the user."""
     place = f": {error.filename}" if error.filename else ""
     return f"{error.strerror or error}{place}"

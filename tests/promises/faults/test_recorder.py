@@ -186,7 +186,7 @@ def test_a_librarys_output_in_the_recorders_process_does_not_end_its_reports(mon
     child.stdout = Lines(lines)
     process._process = child
     process._on_event = hear
-    process._bell = Notifier()
+    process._notifier = Notifier()
     process._trouble = None
     process._status = Status(state=RecorderState.RECORDING, path="f.mcap")
     child.ending, child.quoted_output = "ended with exit code 1", ""

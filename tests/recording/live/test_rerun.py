@@ -213,7 +213,7 @@ def test_a_running_viewer_is_used_and_one_that_does_not_start_is_an_error(
 def test_a_hanging_viewer_gets_nothing_until_it_continues(
     fly: Fly, streams: list[Stream], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rerun_viewer, "_ASK_NS", 0)
+    monkeypatch.setattr(rerun_viewer, "_CHECK_NS", 0)
     viewer = RerunViewer([fly()], save=tmp_path / "flight.rrd")
     (stream,) = streams
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
@@ -18,10 +18,11 @@ from skyloop.files import write
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 1120  #: width of all charts with a time axis; the page scales the charts
+# Sizes in the units of the SVGs, which the page scales.
+WIDTH: Final = 1120  #: width of all charts with a time axis
 LEFT: Final = 64  #: left margin for the labels of the vertical axis
-RIGHT: Final = 16
-TOP: Final = 8
+RIGHT: Final = 16  #: right margin
+TOP: Final = 8  #: top margin
 AXIS: Final = 20  #: margin for the labels of the time axis
 BUCKETS: Final = 700  #: number of buckets of a line, each drawn as its minimum and maximum
 GAP_FACTOR: Final = 8.0  #: minimum length of a gap in a line, as a multiple of the typical step
@@ -233,7 +234,7 @@ def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) 
 
 
 def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int = 48) -> str:
-    """Draw a path in pieces whose colours run from the start colour to the end colour."""
+    """Draw a path in pieces whose colours run from blue at its start to orange at its end."""
     if len(points) < 2:
         return ""
     span = max(float(t_s[-1] - t_s[0]), 1e-9)
@@ -254,16 +255,14 @@ def _coloured_path(points: list[tuple[float, float]], t_s: Floats, colours: int 
     return "".join(parts)
 
 
-def _line(line: Line, axis: TimeAxis, y: object) -> str:
-    place = y
-    assert callable(place)
+def _line(line: Line, axis: TimeAxis, y: Callable[[float], float]) -> str:
     parts = []
     source = pieces(line.t_s, line.values) if line.steps else pieces(*thin(line.t_s, line.values))
     for t_s, values in source:
         points: list[str] = []
         before = ""
         for t, value in zip(t_s, values, strict=True):
-            x, at = f"{axis.x(float(t)):.1f}", f"{place(float(value)):.1f}"
+            x, at = f"{axis.x(float(t)):.1f}", f"{y(float(value)):.1f}"
             if line.steps and before and before != at:
                 points.append(f"{x},{before}")
             if not line.steps or before != at:
@@ -321,7 +320,7 @@ class Page:
         )
 
     def way(self, t_s: Floats, x: Floats, y: Floats) -> None:
-        """Show on the map the position at the time of the cursor."""
+        """Set the path on which the map marks the position at the cursor's time."""
         step = max(1, len(t_s) // 2000)
         self._way = [_numbers(part[::step]) for part in (t_s, np.nan_to_num(x), np.nan_to_num(y))]
 

@@ -54,14 +54,14 @@ class Commands:
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
-    """The difference in one set-point value, over the time in which both recordings contain the value."""
+    """The difference in one set-point value, over the time in which both recordings have an action with that value."""
 
     name: str
     unit: str
     rms: float
     largest: float
     largest_at_s: float
-    seconds: float  #: time during which both recordings contain the field
+    seconds: float  #: duration of that time
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Comparison:
     same_action: float  #: fraction of that duration in which both recordings have the same kind of action
     fields: tuple[FieldDifference, ...]
     part_at_s: float | None  #: time of the first difference, in kind or by more than :data:`PART`; None if none
-    counts: tuple[int, int]
+    counts: tuple[int, int]  #: number of commands in the old and in the new recording
 
 
 def compare(
@@ -88,7 +88,8 @@ def compare(
 ) -> Comparison:
     """Compare the commands that applications requested (or the applied ones), excluding the proxies' own commands.
 
-    The times of a recorded replay are mapped to those of the old flight; otherwise the first commands are aligned.
+    If the recordings overlap in time, their times are used as they are. If the newer one is a replay of the older one,
+    its times are mapped to those of the old flight; otherwise the first commands are aligned.
 
     Args:
         old: The older recording.

@@ -37,7 +37,7 @@ Times = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class RowFormat:
     """Defines the columns that each row has."""
 
     state: tuple[str, ...]  #: names of the values in the state, from :data:`~skyloop.messages.rows.STATE`
@@ -66,7 +66,7 @@ class Episode:
         return len(self.state)
 
 
-def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> Form:
+def row_format_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> RowFormat:
     """Return the columns available in every row of a recording.
 
     Raise ``FileFormatError`` if the recording has no feedback, no set-points, or no frames of a camera, and
@@ -88,10 +88,10 @@ def form_of(tables: Mapping[str, Table], cameras: Sequence[str], fps: float) -> 
             f"the recorded flight used {' and '.join(sorted(kinds))} set-points: an action is either velocity "
             "(forward, left, up, yaw rate) or attitude (roll, pitch, climb, yaw rate)"
         )
-    return Form(state, kinds.pop(), tuple(cameras), fps)
+    return RowFormat(state, kinds.pop(), tuple(cameras), fps)
 
 
-def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode]:
+def episodes(tables: Mapping[str, Table], form: RowFormat, task: str) -> list[Episode]:
     """Cut a recording into episodes.
 
     An episode lasts while the drone follows set-points without a gap in its images or state. Marks split episodes. Its
@@ -99,14 +99,13 @@ def episodes(tables: Mapping[str, Table], form: Form, task: str) -> list[Episode
     capture time, and the set-point in effect when the next row begins, which is the response to that image. Hovering is
     stored as an all-zero set-point. If an application logs arrays named ``action``, these are used as the actions
     instead: each row has the first of these actions at or after its image's capture, and a gap in them ends an episode.
-    ``task``: name of the task where no mark names one. Return the episodes that last at least a second. Raise
-    ``FileFormatError`` if the number of values of a logged action differs from that of the form's set-points.
+    ``task`` names the task where no mark does. Episodes shorter than a second are skipped.
+
+    Raise ``FileFormatError`` if the number of values of a logged action differs from that of the form's set-points.
     """
     feedback, commands = tables["feedback"], tables["commands"]
-    state_ns, frames = (
-        _times(feedback, "captured_ns"),
-        {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras},
-    )
+    state_ns = _times(feedback, "captured_ns")
+    frames = {camera: np.sort(_times(tables[f"frames.{camera}"], "captured_ns")) for camera in form.cameras}
     taught = _taught(tables.get("logs"), form)
     found = []
     for begin_ns, end_ns, what in _parts(feedback, tables.get("logs"), task):
@@ -142,7 +141,7 @@ def _piloted(commands: Table) -> NDArray[np.bool_]:
     return given
 
 
-def _taught(logs: Table | None, form: Form) -> tuple[Times, Floats] | None:
+def _taught(logs: Table | None, form: RowFormat) -> tuple[Times, Floats] | None:
     """Return times and values of the logged actions, or None if there are none."""
     if logs is None or "values" not in logs.columns:
         return None
@@ -190,7 +189,7 @@ def _runs(good: NDArray[np.bool_]) -> list[slice]:
     return [slice(int(begin), int(end)) for begin, end in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
+def _states(feedback: Table, form: RowFormat, at_ns: Times) -> Floats:
     """Return the state interpolated at the given times, with angles going the shorter way around."""
     times = _times(feedback, "captured_ns")
     columns = []
@@ -203,7 +202,7 @@ def _states(feedback: Table, form: Form, at_ns: Times) -> Floats:
     return np.stack(columns, axis=1) if columns else np.empty((len(at_ns), 0))
 
 
-def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
+def _actions(commands: Table, form: RowFormat, by_ns: Times) -> Floats:
     """Return the set-point in effect at the given times, or zeros before the first set-point and while hovering."""
     kept = _piloted(commands) & np.isin(commands["asked"], [form.set_point, _STILL])
     times, moves = _times(commands, "applied_ns")[kept], (commands["asked"] == form.set_point)[kept]
@@ -219,7 +218,7 @@ def _actions(commands: Table, form: Form, by_ns: Times) -> Floats:
 # Their video ----------------------------------------------------------------------------------------------------
 
 
-_KEY_EVERY: Final = 2  #: number of images between key frames; small, because training reads images in random order
+_KEY_EVERY: Final = 2  #: interval between key frames, in images; small, because training reads images in random order
 _LOOKED_AT_EVERY: Final = 16  #: interval, in rows, between the rows sampled for the statistics
 _THINNED: Final = 4  #: spacing of the rows and columns used from a sampled image
 _QUANTILES: Final = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
@@ -231,8 +230,8 @@ class Film:
     """An H.264 MP4 file with one camera's images from all episodes at a fixed rate. It is deleted after an error."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        #: number of rows that repeat the previous image because their own image could not be decoded
-        self.width = self.height = self.repeated = 0
+        self.width = self.height = 0  #: size of the images [px]; 0 before the first one
+        self.repeated = 0  #: number of rows that repeat the previous image because their own could not be decoded
         self._path, self._fps = path, Fraction(fps).limit_denominator(1000)
         self._opened = ExitStack()
         self._container: Any = None
@@ -241,7 +240,6 @@ class Film:
         self._looked_at: list[NDArray[np.uint8]] = []
 
     def __enter__(self) -> Film:
-        """Open the file."""
         import av
 
         self._path.parent.mkdir(parents=True, exist_ok=True)

@@ -21,15 +21,15 @@ from skyloop.files import replacing
 from skyloop.pyav import require_pyav
 from skyloop.recording.layout import Channel
 from skyloop.recording.reader import Recording
-from skyloop.recording.review.episodes import Episode, Film, Form, episodes, form_of, numbers_stats
+from skyloop.recording.review.episodes import Episode, Film, RowFormat, episodes, numbers_stats, row_format_of
 from skyloop.recording.review.tables import tables
 
-VERSION: Final = "v3.0"
+VERSION: Final = "v3.0"  #: version of the dataset format
 STATE: Final = "observation.state"
 ACTION: Final = "action"
 IMAGES: Final = "observation.images."
-LEAST_FPS: Final = 0.5
-MOST_FPS: Final = 120.0
+LEAST_FPS: Final = 0.5  #: minimum number of rows per second
+MOST_FPS: Final = 120.0  #: maximum number of rows per second
 _FILE: Final = "chunk-000/file-000"
 _CHANNELS: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.LOGS, Channel.FRAMES)
 _OTHERS: Final = {"timestamp": "float32"} | dict.fromkeys(
@@ -46,7 +46,7 @@ class Exported:
     """The result of an export."""
 
     folder: Path
-    form: Form
+    form: RowFormat
     episodes: int
     rows: int
     repeated: int  #: number of rows whose image could not be decoded, so they repeat the previous image
@@ -74,15 +74,14 @@ def export_lerobot(
     Args:
         recordings: Recordings of similar drones flown in the same way.
         folder: Folder for the dataset; it must be new or empty.
-        drone: The drone's name in each recording, or None to use the first drone in each.
-        cameras: Cameras to export, or None for all cameras of the first recording.
+        drone: The drone's name in each recording; None for the first drone in each.
+        cameras: Cameras to export, which every recording must have; None for all.
         fps: Rows per second.
         task: Name of the task where no mark names one.
         doing: Called to report the progress.
 
     Raises:
-        UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of
-            range.
+        UsageError: The folder can't be written or is not empty, the recordings don't match, or ``fps`` is out of range.
         UnknownNameError: A recording has no such drone.
         FileFormatError: A recording has no feedback, set-points or frames, or no recording contains an episode.
         MissingExtraError: PyArrow, PyAV or OpenCV is not installed.
@@ -123,21 +122,21 @@ def _read(
     fps: float,
     task: str,
     doing: Doing,
-) -> tuple[Form, list[_Flight]]:
-    form: Form | None = None
+) -> tuple[RowFormat, list[_Flight]]:
+    form: RowFormat | None = None
     flights: list[_Flight] = []
     for number, recording in enumerate(recordings):
         doing("reading", number / len(recordings))
         name = recording.drone(drone).name
         try:
             found = tables(recording, name, _CHANNELS)
-            here = form_of(found, recording.cameras(name) if cameras is None else cameras, fps)
+            here = row_format_of(found, recording.cameras(name) if cameras is None else cameras, fps)
         except (FileFormatError, UsageError) as error:
             raise type(error)(f"{recording.path}: {error}") from None
         form = form or here
         if here != form:
             raise UsageError(
-                f"{recording.path} has {_words(here)}, and {recordings[0].path} {_words(form)}: "
+                f"{recording.path} has {_words(here)}, but {recordings[0].path} has {_words(form)}: "
                 "export mismatched recordings separately, or choose cameras that all of them have"
             )
         flights.append((recording, name, episodes(found, form, task)))
@@ -146,14 +145,14 @@ def _read(
     return form, flights
 
 
-def _words(form: Form) -> str:
+def _words(form: RowFormat) -> str:
     return f"{form.set_point} set-points, the state {', '.join(form.state)} and the cameras {', '.join(form.cameras)}"
 
 
 # Contents of the files ---------------------------------------------------------------------------------------------
 
 
-def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _rows(whole: Sequence[Episode], form: RowFormat, tasks: Sequence[str]) -> dict[str, NDArray[Any]]:
     lengths = [len(episode) for episode in whole]
     within = np.concatenate([np.arange(length) for length in lengths])
     return {
@@ -167,7 +166,7 @@ def _rows(whole: Sequence[Episode], form: Form, tasks: Sequence[str]) -> dict[st
     }
 
 
-def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
+def _episodes(whole: Sequence[Episode], form: RowFormat) -> dict[str, Any]:
     """Return the rows of each episode and its part of each video."""
     ends = np.cumsum([len(episode) for episode in whole])
     begins = ends - [len(episode) for episode in whole]
@@ -190,7 +189,7 @@ def _episodes(whole: Sequence[Episode], form: Form) -> dict[str, Any]:
     return columns
 
 
-def _info(whole: Sequence[Episode], form: Form, tasks: Sequence[str], films: Mapping[str, Film]) -> dict[str, Any]:
+def _info(whole: Sequence[Episode], form: RowFormat, tasks: Sequence[str], films: Mapping[str, Film]) -> dict[str, Any]:
     fps = int(form.fps) if form.fps == int(form.fps) else form.fps
     features: dict[str, Any] = {
         STATE: {"dtype": "float32", "shape": [len(form.state)], "names": list(form.state)},
@@ -247,7 +246,6 @@ class _Writer:
             raise UsageError(f"{folder} is not empty: choose another folder for the dataset, or remove it")
 
     def make_folders(self) -> None:
-        """Create the folder of the dataset."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -277,7 +275,6 @@ class _Writer:
         self.table("meta/tasks.parquet", columns, {"pandas": json.dumps(about)})
 
     def json(self, name: str, value: Any) -> None:
-        """Write a JSON file."""
         with self._replacing(name) as part:
             part.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 

@@ -41,7 +41,8 @@ _MOST_EVENTS: Final = 500  # maximum number of events listed on the page
 _LONGEST_STEP_S: Final = 0.5  #: longest step over which velocity is integrated
 _WIDTH: Final = 360  #: width of a thumbnail [px]
 _QUALITY: Final = 80  # JPEG quality of thumbnails
-_TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
+#: Kinds of events that get a key frame whatever their severity.
+_NOTABLE: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
 _NEAR: Final = 0.4  #: fraction of the usual spacing; an evenly spaced frame this close to an event's frame is skipped
 _SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer delays are skipped, because the two clocks must then be unrelated
 
@@ -49,9 +50,9 @@ _SAME_CLOCK_S: Final = 60.0  #: maximum delay; longer delays are skipped, becaus
 def write_report(
     recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
 ) -> None:
-    """Write the report with up to ``pictures`` key frames per camera. This reads the recording three times.
+    """Write the report with up to ``pictures`` key frames per camera; raise ``UsageError`` if that fails.
 
-    Raise ``UsageError`` if the file can't be written.
+    This reads the recording twice, and once more for each camera.
     """
     report_progress = progress or (lambda _: None)
     summary = summarise(recording, lambda share: report_progress(share / 3))
@@ -62,8 +63,8 @@ def write_report(
     _channels(page, summary)
     page.add(
         f"<footer>{escape(recording.path.name)}, recorded by Skyloop {escape(recording.start.skyloop)}. Times are "
+        "seconds since the first sample, on the clock of the drone's proxy.</footer>"
     )
-    page.add("seconds since the first sample, on the clock of the drone's proxy.</footer>")
     page.write(path)
 
 
@@ -351,7 +352,7 @@ def flight_facts(
         if np.isfinite(speed).any():
             found.append(("fastest", f"{np.nanmax(speed):.2f} m/s"))
         if path is not None:
-            found.append(("way", f"{path.length_m:.1f} m"))
+            found.append(("distance", f"{path.length_m:.1f} m"))
         battery = feedback.numbers("battery")
         battery = battery[np.isfinite(battery)]
         if len(battery):
@@ -376,7 +377,7 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
         candidates = [
             (float(t), str(text))
             for t, kind, severity, text in rows
-            if first_s <= t <= last_s and (kind in _TELLING or severity != "info")
+            if first_s <= t <= last_s and (kind in _NOTABLE or severity != "info")
         ]
         step = max(1, -(-len(candidates) // max(1, most // 2)))
         chosen = candidates[::step]

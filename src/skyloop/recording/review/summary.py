@@ -179,12 +179,12 @@ class Recovered:
     messages: dict[str, int]  #: number of messages by topic
     seconds: float
     size: int  #: size of the new file [bytes]
-    lost: int  #: upper limit for the number of unreadable bytes in the old file
+    lost: int  #: upper bound on the number of unreadable bytes in the old file
     why: tuple[str, ...]  #: problems with the old file
 
 
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
-    """Read every byte of a recording and describe its problems; return nothing if it is intact."""
+    """Read every byte of a recording and describe its problems; empty if it is intact."""
     for _ in recording.entries(progress=progress):
         pass  # reading is enough, because it verifies the checksums
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)

@@ -215,7 +215,7 @@ def _action(prefix: str, action: AnyAction) -> dict[str, Cell]:
 
 
 def _flat(value: Any) -> Cell:
-    """Convert a composite value to JSON."""
+    """Convert lists and dictionaries to JSON text."""
     cell: Cell = msgspec.json.encode(value).decode() if isinstance(value, list | dict) else value
     return cell
 
@@ -276,7 +276,7 @@ def export_parquet(found: dict[str, Table], folder: Path) -> list[Path]:
 
 
 def export_npz(found: dict[str, Table], path: Path) -> list[Path]:
-    """Write a compressed ``.npz`` (a suffix added to the path) with an array ``CHANNEL/COLUMN`` per column."""
+    """Write a ``.npz`` file (the suffix replaces any other) with a compressed array ``CHANNEL/COLUMN`` per column."""
     arrays = {f"{name}/{column}": values for name, table in found.items() for column, values in table.columns.items()}
     path = path if path.suffix == ".npz" else path.with_suffix(".npz")
     with replacing(path) as part:

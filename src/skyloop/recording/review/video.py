@@ -53,18 +53,12 @@ def export_mp4(
 ) -> Videos:
     """Write one camera's frames as a video with their capture times.
 
-    H.264 is copied as recorded, without decoding, if nothing is drawn on the frames. If its size or another parameter
-    changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that depend on missing frames are omitted.
-    All other images are encoded into one file, omitting damaged frames and frames that differ in size from the first.
+    H.264 is copied as recorded, without decoding, unless the time is drawn, ``encode`` is set, or some frames are JPEG
+    or PNG. If its size or another parameter changes, a new file is started: ``film.mp4``, ``film-2.mp4``, … Frames that
+    depend on missing frames are omitted. Otherwise, all frames are encoded into one file, omitting damaged frames and
+    frames that differ in size from the first.
 
-    Args:
-        recording: The recording.
-        drone: The drone's name.
-        camera: The camera's name.
-        path: The file to write.
-        burn_time: Whether to draw the time since the recording's start in a corner of each frame.
-        encode: Whether to re-encode even H.264.
-        progress: Called with the fraction read so far, 0 to 1.
+    ``burn_time`` draws the time since the recording's start in a corner of each frame; ``encode`` re-encodes H.264.
 
     Raises:
         UnknownNameError: The recording has no such drone or camera.
@@ -214,7 +208,7 @@ def _nothing(recording: Recording, camera: str) -> FileFormatError:
 TIME_BASE: Final = Fraction(1, 90_000)  #: time base of the files; the one commonly used for video
 MAX_FILES: Final = 50  #: maximum number of files; a stream that would need more is encoded instead
 _LONGEST_STEP: Final = round(3600 / TIME_BASE)  #: longest step between frames; 31 bits hold less than seven hours
-_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration assigned to the last image
+_USUAL_STEP: Final = round(1 / 30 / TIME_BASE)  #: duration of the last image of a file
 
 
 @dataclass(frozen=True, slots=True)
