@@ -36,9 +36,9 @@ from skyloop.messages import Role
 
 SESSION_S: Final = 12 * 3600.0  #: period for which a session is valid
 PAIRING_S: Final = 3600.0  #: period for which a pairing code is valid
-MAX_SESSIONS: Final = 1000
+MAX_SESSIONS: Final = 1000  #: a further log-in ends the oldest session
 SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
-MAX_TOKEN: Final = 256
+MAX_TOKEN: Final = 256  #: maximum length in characters
 CERTIFICATE: Final = "peer_certificate"  #: key under which a connection's state holds the client's certificate
 
 FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubled by each further one
@@ -47,7 +47,7 @@ FORGET_S: Final = 600.0  #: an address starts over if it has sent no wrong token
 MAX_ADDRESSES: Final = 1024  #: maximum number of addresses remembered; the quietest one is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens allowed per minute, over all addresses, before the delay below is added
 EACH_IN_ALL_S: Final = 0.1  #: additional delay for each wrong token beyond those, from any address
-MOST_IN_ALL_S: Final = 4.0
+MOST_IN_ALL_S: Final = 4.0  #: maximum of this additional delay
 _MINUTE_NS: Final = nanoseconds(60.0)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
@@ -62,12 +62,11 @@ _log = logging.getLogger(__name__)
 
 
 def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
-    """Return the user id of the program at the client end of a loopback connection.
+    """Return the user id of the program at the client end of a loopback connection, or None if it is unknown.
 
-    Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
-    proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
-    state, …, user id and inode. A socket that its program has already closed is listed with user 0 and inode 0, so an
-    entry without an inode does not reveal who opened the socket. Return the user id, or None if it is unknown.
+    The kernel's tables of sockets (``/proc/net/tcp`` and ``tcp6``, Linux only) are described in proc_pid_net(5) and in
+    the kernel's ``proc_net_tcp.txt``. A socket that its program has already closed is listed with user 0 and inode 0,
+    so an entry without an inode does not reveal who opened the socket.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -129,7 +128,7 @@ class Gate(Protocol):
 
 
 class OpenGate:
-    """Gives the same role to every program of the same user on this machine.
+    """Gives one role to every program of this user, or of the superuser, on this machine.
 
     ``uid_of``: returns the client's user id, given the addresses of both ends.
     """
@@ -415,7 +414,7 @@ class WrongTokens:
 # Sessions that outlive the cockpit's process ---------------------------------------------------------------------
 
 
-MAX_BYTES: Final = 1_000_000
+MAX_BYTES: Final = 1_000_000  #: the file's maximum size; a longer one counts as damaged
 
 
 class Session(msgspec.Struct, frozen=True):

@@ -13,7 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from skyloop.cockpit.access import SESSION_S, Gate, TokenGate
+from skyloop.cockpit.access import MAX_TOKEN, SESSION_S, Gate, TokenGate
 from skyloop.cockpit.security import gone_within, person_of
 from skyloop.cockpit.telemetry import encode_json, number
 from skyloop.control.route import check_for, parse_route
@@ -130,7 +130,7 @@ async def body_of(request: Request, kind: type[T]) -> T:
 
 
 class _Login(msgspec.Struct):
-    token: Annotated[str, msgspec.Meta(max_length=256)]
+    token: Annotated[str, msgspec.Meta(max_length=MAX_TOKEN)]
 
 
 class Api:
@@ -170,7 +170,7 @@ class Api:
     # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
-        """Respond with the client's role, or with null for strangers, and a hint on how to log in."""
+        """Respond with the client's role and name or, for strangers, with a null role and a hint on how to log in."""
         person = person_of(request.scope)
         return answer_json(
             {
@@ -210,7 +210,6 @@ class Api:
 
     @answered
     async def logout(self, request: Request) -> Response:
-        """End the session of the request's cookie."""
         answer = answer_json({"role": None})
         if isinstance(self._gate, TokenGate):
             self._gate.end(request.scope)
@@ -229,7 +228,6 @@ class Api:
     # Drones ----------------------------------------------------------------------------------------------------
 
     async def drones(self, _: Request) -> Response:
-        """Respond with the connected drones."""
         return answer_json(
             [
                 {"name": name, "uri": one.drone.uri, "cameras": [c.name for c in one.drone.capabilities.cameras]}
@@ -239,7 +237,6 @@ class Api:
 
     @answered
     async def parameters(self, request: Request) -> Response:
-        """Respond with a drone's parameters."""
         station = self._fleet.station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
@@ -271,7 +268,7 @@ class Api:
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter as JSON values, including all information needed to edit it."""
+    """Return a parameter as JSON values, with everything needed to edit it."""
     return {
         "name": parameter.name,
         "type": str(parameter.type),
@@ -320,14 +317,12 @@ class RoutesApi:
 
     @answered
     async def listing(self, _: Request) -> Response:
-        """Respond with the stored routes."""
         return answer_json(await asyncio.to_thread(self._files.listing))
 
     @answered
     async def load(self, request: Request) -> Response:
-        """Respond with a route's file."""
         route = await asyncio.to_thread(self._files.load, request.path_params["name"])
-        return Response(route.to_json(), media_type="application/json")
+        return Response(route.to_json(), media_type=_JSON)
 
     @answered
     async def save(self, request: Request) -> Response:

@@ -17,14 +17,14 @@ import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyline, Text
-from skyloop.messages.relayed import MOCAP as SERIES
+from skyloop.messages.relayed import MOCAP
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Listener
 
 ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
-KEPT_EVENTS = 256
+KEPT_EVENTS = 256  #: maximum number of events kept per drone
 KEPT_S = 10.0  #: older drawings and logs are removed from the display
 MAX_SERIES = 256  #: maximum number of logged series shown per drone
 MAX_SOURCES = 64  #: maximum number of sources of drawings shown per drone, across all of its cameras
@@ -42,7 +42,7 @@ V = TypeVar("V")
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread. Do nothing if the loop is closed and no pages are left."""
+    """Call a function on the loop, from any thread. Do nothing once the loop is closed: no pages are left then."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
 
@@ -76,7 +76,7 @@ class PeriodicBroadcast:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and at once if one is already fresh, unless the broadcast is closed."""
+        """Call ``wake`` now and for each new message; if the broadcast is closed, only now."""
         if self.closed:
             wake()
             return
@@ -252,7 +252,7 @@ class LogFeed:
         self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe if the values are wanted; otherwise, unsubscribe and forget the values."""
+        """Subscribe, or unsubscribe and forget the values."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -296,7 +296,7 @@ class LogFeed:
     def _log(self, entry: LogEntry) -> None:
         if entry.number is not None:
             self._numbers.put(entry.name, entry.number)
-        elif entry.values is not None and entry.name == SERIES and len(entry.values) >= 7:
+        elif entry.values is not None and entry.name == MOCAP and len(entry.values) >= 7:
             self._mocap = self._clock(), entry.values
         elif (
             entry.values is not None and entry.name == WAYPOINTS and len(entry.shape) == 2 and entry.shape[1] in (3, 4)

@@ -28,7 +28,7 @@ MAX_NAME_BYTES: Final = 200  #: maximum length of a name; file systems allow 255
 MAX_TEXT: Final = 4000  #: maximum length of a note [characters]
 MAX_MARK: Final = 200  #: maximum length of a mark [characters]
 MAX_MARKS: Final = 200  #: maximum number of marks per recording
-MAX_AT_S: Final = 1e6
+MAX_AT_S: Final = 1e6  #: latest position of a mark; longer than any recording
 _MOST_BYTES: Final = 1 << 20  #: maximum size of a notes file
 _NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and characters that other systems forbid
 

@@ -13,8 +13,8 @@ import msgspec
 from skyloop.control.route import ENDING, Route, RouteCheck, checked, load_route, save_route
 from skyloop.errors import RefusedError, SkyloopError, UnknownNameError, UsageError
 
-MOST_FILES: Final = 200
-MOST_CHECKED: Final = 16
+MOST_FILES: Final = 200  #: maximum number of routes in the folder
+MOST_CHECKED: Final = 16  #: maximum number of checked routes per drone; the one checked longest ago is dropped first
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,47}")
 
 Json = dict[str, Any]
@@ -31,13 +31,12 @@ class RouteFiles:
 
     def listing(self) -> Json:
         """Return the routes as JSON values, by name; for an unreadable file, return the problem instead."""
-        files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
-        return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
+        return {"folder": str(self.folder), "routes": [self._entry(path) for path in self._files()[:MOST_FILES]]}
 
     def load(self, name: str) -> Route:
         """Read a route.
 
-        Raise ``UnknownNameError`` if there is no route with that name, and ``SkyloopError`` if the file can't be read.
+        Raise ``UnknownNameError`` if there is no such route, ``UsageError`` if the name is invalid.
         """
         path = self._path(name)
         if not path.is_file():

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SEND_HZ: Final = 60.0  #: maximum number of messages per second
 GATHER_S: Final = 0.005  #: time for which a picture waits for pictures of other cameras, which often arrive together
 MAX_SHOWN: Final = 64  #: maximum number of cameras shown on one page at a time
-_BAD_MESSAGE: Final = 1008
+_BAD_MESSAGE: Final = 1008  # WebSocket close code: policy violation (RFC 6455)
 
 
 class _Place(msgspec.Struct, frozen=True):
@@ -39,18 +39,14 @@ class _Place(msgspec.Struct, frozen=True):
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """A message from a page.
+    """A message from a page."""
 
-    The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes H.264) or stops showing it; it can't
-    decode a camera's pictures until the next key frame (``key``); or it acknowledges what it has drawn.
-    """
-
-    show: _Place | None = None
-    hide: _Place | None = None
-    width: int = 0
-    h264: bool = False
-    key: _Place | None = None
-    ack: int | None = None
+    show: _Place | None = None  #: show this camera
+    hide: _Place | None = None  #: stop showing this camera
+    width: int = 0  #: with ``show``: width of the pane [device pixels]
+    h264: bool = False  #: with ``show``: whether the page decodes H.264
+    key: _Place | None = None  #: the page can't decode this camera's pictures until the next key frame
+    ack: int | None = None  #: number of the message that the page has drawn
 
 
 @dataclass(slots=True)
@@ -102,7 +98,7 @@ class _Shown:
 
 
 class SmallVideoSender:
-    """Sends one page the newest frame of each camera that it shows, in one message, until the page disconnects.
+    """Sends one page the new frames of all cameras that it shows in one message, until the page disconnects.
 
     The next message is sent once the page has drawn the previous one. A slow page therefore receives fewer frames, but
     never older ones, and does not delay other pages.

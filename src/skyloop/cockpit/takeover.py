@@ -123,9 +123,9 @@ class QueueTracker:
             self._declined = str(event.data.get("reason", ""))
 
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
-        """Return the page's position in the queue.
+        """Return the page's position in the queue, or None if the page is not waiting.
 
-        Return None if the page is not waiting. Otherwise, the value changes only when the status changes.
+        The time at which its turn is expected is fixed until the status changes.
         """
         if status.state == "held":  # a pilot that was overruled regains authority later without asking
             self.request(ask=False)
@@ -181,7 +181,7 @@ GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later los
 class AuthorityReport:
     """Compares the current authority with the last message sent to the page. Used on the event loop.
 
-    ``gone_s``: the page's control expires after the cockpit has been silent for this long [s].
+    ``gone_s``: the page's control expires once the cockpit has received nothing from the page for this long [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:
@@ -253,7 +253,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is known to be higher than that of the holder."""
+        """Return whether a priority is higher than the holder's, or the holder's is unknown."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:
@@ -261,7 +261,7 @@ class AuthorityReport:
         return held is None or priority < held
 
     def busy(self, priority: int) -> str:
-        """Return text that explains why a given priority can't take control."""
+        """Explain why an application with this priority can't take control."""
         try:
             feedback = self._station.feedback()
         except LinkError:

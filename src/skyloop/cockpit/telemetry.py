@@ -242,7 +242,7 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """Return the newest values of everything that changes, as a JSON object that lacks its final brace."""
+        """Return all values that change, as a JSON object without its final brace: each page's events are appended."""
         self._refresh_channels()
         return encode_json(self._values(self._clock()))[:-1]
 

@@ -31,14 +31,13 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.messages import CameraInfo, Feedback, Value
-    from skyloop.messages.parameter import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
 RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Return a drone's surroundings for maps. This function queries the drone's proxy and waits for the answers.
+    """Query a drone's surroundings for maps; waits for the answers of its proxy.
 
     ``given``: the scenery to use if the drone does not report any.
     """
@@ -57,10 +56,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 
 
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
-    """Return the proxy's objections to a straight flight from the drone's position to a place.
-
-    ``place``: the place, in world axes [m].
-    """
+    """Return the proxy's objections to a straight flight from the drone's position to a place, in world axes [m]."""
     read = _reader(drone)
 
     def limit(name: str) -> float:
@@ -215,7 +211,7 @@ class WorldApi:
         return await self._ask(request, check)
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
-        """Query a drone on a thread, because its response may take a while."""
+        """Query a drone on a thread, because its proxy may take a while to answer."""
         drone = self._fleet.station(request.path_params["name"]).drone
         async with self._asking:
             return answer_json(await asyncio.to_thread(question, drone))
