@@ -1,4 +1,4 @@
-"""Parsing and checking of the options in ``ros2://`` addresses. Pure."""
+"""Options in a ``ros2://`` address, listed in ``docs/ros.md``. Pure."""
 
 from __future__ import annotations
 

@@ -221,8 +221,8 @@ class Altitude:
 class Battery:
     """The battery's state."""
 
-    voltage_v: float  #: [V]
-    current_a: float  #: [A]
+    voltage_v: float
+    current_a: float
     cells: int = 0  #: number of cells; 0 if unknown
     left: float | None = None  #: remaining charge, 0 to 1; None if not reported
 
@@ -451,7 +451,7 @@ def features(payload: bytes) -> int:
     return bits
 
 
-ANGLE_LIMIT_AT: Final = 17
+ANGLE_LIMIT_AT: Final = 17  #: offset of the limit in ``PID_ADVANCED``
 
 
 def angle_limit_deg(payload: bytes) -> int:
