@@ -87,10 +87,7 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 
 
 def _table_entry(end: Endpoint, mapped: bool) -> str:
-    """Format an address as the table does: 32-bit words in the host's byte order.
-
-    ``mapped``: whether to write an IPv4 address as an IPv4-mapped IPv6 address.
-    """
+    """Format an address as the table does, in 32-bit words of host order. ``mapped``: write IPv4 as IPv6."""
     address = ipaddress.ip_address(end[0])
     packed = address.packed
     if mapped and address.version == 4:
@@ -253,10 +250,7 @@ class TokenGate:
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
-        """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
-
-        ``token``: the token for which the session was created.
-        """
+        """Begin a session and return its cookie; drop the oldest if there are too many. ``token``: its token."""
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
         while len(self._sessions) >= MAX_SESSIONS:
@@ -296,11 +290,7 @@ class CertificateGate:
 
 
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
-    """Return the role and name in a certificate.
-
-    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None unless
-    exactly one OU is a role.
-    """
+    """Return the role and name in an ``SSLObject.getpeercert()`` certificate; None unless exactly one OU is a role."""
     if not certificate:
         return None
     fields = [pair for part in certificate.get("subject", ()) for pair in part]
@@ -366,7 +356,6 @@ def _header(scope: Scope, wanted: bytes) -> str | None:
 
 
 def has_token(scope: Scope) -> bool:
-    """Return whether this request carries a token."""
     return any(name.lower() == b"authorization" for name, _ in scope["headers"])
 
 

@@ -26,8 +26,6 @@ _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
 
 
 class AlarmSeverity(StrEnum):
-    """How urgent an alarm is."""
-
     WARNING = "warning"
     CRITICAL = "critical"
 
@@ -181,7 +179,6 @@ class ThresholdReader:
         return self._values
 
     def close(self) -> None:
-        """Unregister from the drone."""
         self._listener.cancel()
 
     async def _read(self) -> None:

@@ -109,10 +109,7 @@ def check_json(request: Request) -> None:
 
 
 async def body_of(request: Request, kind: type[T]) -> T:
-    """Read and decode a request's body.
-
-    Raise ``BadRequest`` if the body is not JSON, is too large, does not arrive in time, or has the wrong type.
-    """
+    """Read and decode a body; raise ``BadRequest`` if it is not JSON, too large, too late, or of the wrong type."""
     check_json(request)
     data = b""
     try:
@@ -243,10 +240,7 @@ class Api:
         return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
-        """Respond with counts of the messages sent to pages.
-
-        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` covers only the current cameras.
-        """
+        """Respond with the server's :class:`.PageCounts`; ``frames_encoded`` covers only the current cameras."""
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return answer_json(
             {
@@ -326,7 +320,6 @@ class RoutesApi:
 
     @answered
     async def save(self, request: Request) -> Response:
-        """Store a route under the given name."""
         name, route = request.path_params["name"], parse_route(bytes(await body_of(request, msgspec.Raw)))
         await asyncio.to_thread(self._files.save, name, route)
         return answer_json({"name": name}, 201)

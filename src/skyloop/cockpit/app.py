@@ -157,7 +157,6 @@ class Cockpit:
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        """Run the fleet while the server runs."""
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS, "cockpit"))
         await self._fleet.start()
         try:
@@ -171,12 +170,10 @@ class Cockpit:
         return await self.files.page()
 
     async def overview(self, socket: WebSocket) -> None:
-        """Send the overview of all drones to a page."""
         await socket.accept()
         await BroadcastSender(socket, self._overview.broadcast).run()
 
     async def small_video(self, socket: WebSocket) -> None:
-        """Send small video streams of many drones to a page."""
         await socket.accept()
         await SmallVideoSender(socket, self._fleet.stations, self.counts).run()
 
@@ -190,7 +187,6 @@ class Cockpit:
         await FleetSession(socket, self._fleet, person.name).run()
 
     async def telemetry(self, socket: WebSocket) -> None:
-        """Send one drone's telemetry to a page."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -201,7 +197,6 @@ class Cockpit:
             self.counts.pages -= 1
 
     async def video(self, socket: WebSocket) -> None:
-        """Send one camera's video to a page."""
         station = await self._accept(socket)
         if station is None:
             return

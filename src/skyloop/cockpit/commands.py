@@ -154,8 +154,6 @@ class StopFollowing(Command, frozen=True, tag="follow_stop"):
 
 
 class Write(Command, frozen=True, tag="set"):
-    """Write a parameter."""
-
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
     value: bool | int | float | str | list[float]
 

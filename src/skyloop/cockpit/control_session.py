@@ -508,7 +508,6 @@ class ControlSession:
                     self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
-        """Handle requests to take over control."""
         if self._pilot is not None:
             self._takeover.on_event(event, self._pilot)
 

@@ -121,7 +121,6 @@ class CameraFeed:
         return await asyncio.shield(self._jpeg[1])
 
     def close(self) -> None:
-        """Unsubscribe from the camera."""
         if self._listener is not None:
             self._listener.cancel()
             self._listener = None
@@ -187,7 +186,6 @@ class SmallFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows the camera."""
         return self._pages > 0
 
     @property
@@ -297,7 +295,6 @@ class EncodedFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows these pictures."""
         return bool(self._wakes)
 
     @property

@@ -72,7 +72,6 @@ class PeriodicBroadcast:
 
     @property
     def wanted(self) -> bool:
-        """Whether there are subscribers."""
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
@@ -148,7 +147,6 @@ class Newest(Generic[K, V]):
         return [(key, value) for key, (at_ns, value) in list(self._values.items()) if at_ns > oldest_ns]
 
     def clear(self) -> None:
-        """Forget all values."""
         self._values = {}
 
 
@@ -165,7 +163,6 @@ class Drawing:
 
 
 def drawing_values(annotation: Annotation) -> dict[str, Any]:
-    """Return an annotation as JSON values for pages."""
     return {
         "type": "drawing",
         "source": annotation.source,
@@ -185,10 +182,7 @@ def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
 
 
 class EventFeed:
-    """The annotations and events of the drone.
-
-    Events are numbered here, because events created by the client have no number.
-    """
+    """The annotations and events of the drone. Events are numbered here, because those of the client have no number."""
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
         self.drawings: Newest[tuple[str, str], Drawing] = Newest(MAX_SOURCES, clock)  #: keyed by camera and source
@@ -207,7 +201,6 @@ class EventFeed:
         self._wakes.add(wake)
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``."""
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
@@ -215,7 +208,6 @@ class EventFeed:
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
-        """Unregister from the drone."""
         for listener in self._listeners:
             listener.cancel()
 
@@ -275,18 +267,12 @@ class LogFeed:
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the most recently logged array ``waypoints``, if it was logged within :data:`KEPT_S`.
-
-        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are no waypoints.
-        """
+        """Return recently logged waypoints, or nothing: rows of x, y, z [m] and possibly yaw [rad], in world axes."""
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
 
     def mocap(self) -> tuple[float, ...] | None:
-        """Return the newest pose from motion capture.
-
-        Return x, y, z [m] and the quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
-        """
+        """Return a recent motion-capture pose, or None: x, y, z [m] and the quaternion x, y, z, w."""
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None
 

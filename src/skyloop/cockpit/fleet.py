@@ -47,10 +47,7 @@ Json = dict[str, Any]
 
 
 def observe(found: Found) -> Drone:
-    """Connect to a proxy as an observer.
-
-    Raise ``SkyloopError`` if the connection was not established within :data:`CONNECT_S`.
-    """
+    """Connect to a proxy as an observer; raise ``SkyloopError`` if that takes longer than :data:`CONNECT_S`."""
     from skyloop.client.drone import open_drone
 
     return open_drone(found.dial, app="cockpit", access="observe", timeout_s=CONNECT_S)
@@ -226,7 +223,6 @@ class FleetSession:
         self._clock = clock
 
     async def run(self) -> None:
-        """Serve the page until it disconnects."""
         await self._page.serve(self._on_messages)
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:

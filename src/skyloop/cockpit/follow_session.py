@@ -104,10 +104,7 @@ class FollowSession:
     # Requests from the page ------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
-        """Keep the frames of a camera until a box arrives or the page cancels.
-
-        Raise ``UnknownNameError`` if the vehicle has no such camera.
-        """
+        """Keep a camera's frames until a box arrives or the page cancels; raise ``UnknownNameError`` without it."""
         if self._keeper is not None:
             self._keeper.close()
             self._keeper = None

@@ -48,10 +48,7 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def check_name(text: str) -> str:
-    """Return the file name, including suffix, for a recording's name typed by a person.
-
-    Raise ``UsageError`` if the name is invalid; the message says why.
-    """
+    """Return the file name, with suffix, for a name typed by a person; raise ``UsageError`` if the name is invalid."""
     name = unicodedata.normalize("NFC", text).strip()
     name = name.removesuffix(ENDING).rstrip()
     for character in name:
@@ -69,7 +66,6 @@ def check_name(text: str) -> str:
 
 
 def notes_path(path: Path) -> Path:
-    """Return the path of a recording's notes."""
     return path.with_name(path.name.removesuffix(ENDING) + NOTES_ENDING)
 
 

@@ -74,10 +74,7 @@ def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
 
 
 def start_replay(path: Path, drone: str | None = None) -> Drone:
-    """Start a private proxy that plays a file, and connect to the proxy.
-
-    ``drone``: the recorded drone to play, or None for the first drone.
-    """
+    """Start a private proxy that plays a file, and connect to it. ``drone``: whose recording; None for the first."""
     from skyloop.client import connect
 
     which = "" if drone is None else f"?drone={quote(drone)}"
@@ -92,8 +89,6 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A running replay."""
-
     drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
     recorded: str | None  #: the drone's name in the recording; None for the first drone
@@ -172,10 +167,7 @@ class Recordings:
             return self._entry(number)
 
     async def stop(self, number: str) -> Json:
-        """Stop a recording and wait until its file is closed.
-
-        Raise ``UnknownNameError`` if no such recording is running.
-        """
+        """Stop a recording and wait until its file is closed; raise ``UnknownNameError`` if it is not running."""
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
         entry = self._entry(number)
@@ -204,10 +196,7 @@ class Recordings:
     # Files -----------------------------------------------------------------------------------------------------
 
     async def path(self, name: str) -> Path:
-        """Return the path of a recording.
-
-        Raise ``UnknownNameError`` if the file does not exist or is being recorded.
-        """
+        """Return the path of a recording; raise ``UnknownNameError`` if it does not exist or is being recorded."""
         return await asyncio.to_thread(self._path, name)
 
     async def move(self, name: str, change: Callable[[Path], str]) -> str:

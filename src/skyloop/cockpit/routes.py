@@ -21,10 +21,7 @@ Json = dict[str, Any]
 
 
 class RouteFiles:
-    """The routes in one folder, each in a file ``NAME.route.json``. Methods access files, so call them on a thread.
-
-    ``folder``: created when needed.
-    """
+    """A folder of routes, created when needed, each in a file ``NAME.route.json``. Its methods block: use a thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -34,10 +31,7 @@ class RouteFiles:
         return {"folder": str(self.folder), "routes": [self._entry(path) for path in self._files()[:MOST_FILES]]}
 
     def load(self, name: str) -> Route:
-        """Read a route.
-
-        Raise ``UnknownNameError`` if there is no such route, ``UsageError`` if the name is invalid.
-        """
+        """Read a route; raise ``UnknownNameError`` without one, another ``SkyloopError`` if name or file is invalid."""
         path = self._path(name)
         if not path.is_file():
             raise UnknownNameError("route", name, [one.name.removesuffix(ENDING) for one in self._files()])
@@ -104,10 +98,7 @@ class CheckedRoutes:
         return {"id": number, "ok": check.ok, **msgspec.to_builtins(check)}
 
     def get(self, number: str) -> Route:
-        """Return a checked route.
-
-        Raise ``RefusedError`` if the route was not checked, or if too many other routes have been checked since.
-        """
+        """Return a checked route; raise ``RefusedError`` if it was not checked, or too many have been checked since."""
         if number not in self._routes:
             raise RefusedError("this route was not checked recently: check it again")
         return self._routes[number]

@@ -41,10 +41,7 @@ _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
 def bind_address(host: str) -> tuple[str, bool]:
-    """Return the address to bind to, and whether it is a loopback address.
-
-    Raise ``UsageError`` if the text is not an address.
-    """
+    """Return the address to bind to and whether it is a loopback address; raise ``UsageError`` if it is no address."""
     if host == "localhost":
         return "127.0.0.1", True
     try:

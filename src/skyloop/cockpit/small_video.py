@@ -32,15 +32,11 @@ _BAD_MESSAGE: Final = 1008  # WebSocket close code: policy violation (RFC 6455)
 
 
 class _Place(msgspec.Struct, frozen=True):
-    """A camera of a drone."""
-
     drone: str
     camera: str
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """A message from a page."""
-
     show: _Place | None = None  #: show this camera
     hide: _Place | None = None  #: stop showing this camera
     width: int = 0  #: with ``show``: width of the pane [device pixels]
@@ -61,10 +57,7 @@ class _Shown:
     sent: int = 0  #: serial number of the last JPEG sent
 
     def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
-        """Subscribe to the camera; also called after the drone has been reconnected or replaced.
-
-        JPEGs are subscribed to only while nothing else is shown.
-        """
+        """Subscribe to the camera, again if the drone was replaced; to JPEGs only while nothing else is shown."""
         if station is not self.station:
             self.release()
             self.station = station
@@ -84,13 +77,11 @@ class _Shown:
                     self.feed, self.sent = feed, 0
 
     def release_feed(self) -> None:
-        """Unsubscribe from JPEGs."""
         if self.feed is not None:
             self.feed.unsubscribe()
             self.feed = None
 
     def release(self) -> None:
-        """Unsubscribe from the camera."""
         self.release_feed()
         if self.stream is not None:
             self.stream.close()
@@ -115,7 +106,6 @@ class SmallVideoSender:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
         due_s = time.monotonic()

@@ -78,10 +78,7 @@ class PilotConnection(Drone):
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer a request for authority and wait until the proxy has received the answer.
-
-        Raise ``RefusedError`` if this connection no longer holds authority.
-        """
+        """Answer a request for authority, and wait for the proxy; raise ``RefusedError`` without authority."""
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
     @property
@@ -266,10 +263,7 @@ class Station:
     # Pilots ----------------------------------------------------------------------------------------------------
 
     async def open_pilot(self, app: str) -> PilotConnection:
-        """Open a connection for a pilot, without requesting authority yet.
-
-        Raise ``SkyloopError`` if the connection can't be opened within :data:`PILOT_S`.
-        """
+        """Open a pilot's connection, without authority; raise ``SkyloopError`` if this takes over :data:`PILOT_S`."""
 
         def connect() -> PilotConnection:
             return PilotConnection.open(self.found.dial, app, PILOT_S)

@@ -83,10 +83,7 @@ class PagePath:
         return count
 
     def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
-        """Update the assessment; return whether the page is behind.
-
-        ``extra_s``: time it takes pictures to reach the cockpit [s].
-        """
+        """Return whether the page is behind now. ``extra_s``: time it takes pictures to reach the cockpit [s]."""
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
         if self._changed_ns is None or late != self._was_late:
@@ -297,7 +294,6 @@ class VideoSender:
         self._drawn: dict[str, int] = {}  # capture times of the drawings sent last, by source in the order of sending
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         self._event_feed.subscribe(self._wake.set)
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
@@ -439,7 +435,6 @@ class BroadcastSender:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         gone = asyncio.create_task(self._until_gone())
         gone.add_done_callback(lambda _: self._wake.set())
         self._broadcast.subscribe(self._wake.set)
@@ -535,8 +530,6 @@ class PageSocket:
 
 
 class _FromPage(msgspec.Struct):
-    """A message from a page."""
-
     ack: int | None = None  #: number of the newest picture that the page has drawn
     h264: bool | None = None  #: whether the page decodes H.264
     width: int = 0  #: with ``h264``: width of the pane [device pixels]; 0 for full size
@@ -553,12 +546,10 @@ def _decode(text: str) -> _FromPage | None:
 
 
 def picture_values(picture: Frame | SmallFrame | EncodedFrame, age_s: float, width: int, height: int) -> dict[str, Any]:
-    """Return a picture's description for pages, as JSON values."""
     captured = str(picture.captured_ns)  # too large for a JavaScript number
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 
 
 def encoding_values(one: Sent) -> dict[str, Any]:
-    """Return how a picture is encoded, as JSON values for a page."""
     values = {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}
     return values | {"late": True} if one.form.subscriber and one.late_here else values

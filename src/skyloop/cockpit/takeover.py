@@ -118,7 +118,6 @@ class QueueTracker:
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
-        """Handle an event received by the application with this number."""
         if event.kind is EventKind.AUTHORITY_DECLINED and event.data.get("app_id") == app_id:
             self._declined = str(event.data.get("reason", ""))
 
@@ -148,7 +147,6 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Start over, because the page has requested authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:
@@ -204,10 +202,7 @@ class AuthorityReport:
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
-        """Return the message for the page, or None if nothing has changed.
-
-        ``pilot``: the page's own connection, if any. ``place``: the page's position in the queue while it waits.
-        """
+        """Return the message for the page; None if nothing has changed. ``place``: in the queue, while it waits."""
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
         next_owner: str | None = None  # name of the first application in the queue, which may be a program

@@ -70,10 +70,7 @@ class KeptFrames:
         self.bytes = 0
 
     def find(self, captured_ns: int) -> Arrival:
-        """Return the frame with this capture time.
-
-        Raise ``RefusedError`` if the frame was not kept; the message says why.
-        """
+        """Return the frame with this capture time; raise ``RefusedError``, which says why, if it was not kept."""
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
                 return arrival
@@ -290,7 +287,6 @@ class TargetTracker:
         self._keeper.close()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the started thread has ended."""
         self._thread.join(timeout_s)
 
     # On the thread ---------------------------------------------------------------------------------------------

@@ -80,11 +80,7 @@ class HeadlessPage:
         )
 
     async def run(self) -> None:
-        """Watch until cancelled.
-
-        Raises:
-            LinkError: The cockpit closed the connection or refused the page.
-        """
+        """Watch until cancelled; raise ``LinkError`` if the cockpit closed the connection or refused the page."""
         base = f"/ws/drones/{self.drone}"
         try:
             async with self.open(f"{base}/telemetry") as socket:
@@ -154,7 +150,6 @@ class Pages:
 
     @property
     def frames(self) -> int:
-        """Total number of frames on all pages."""
         return sum(client.frames for client in self.clients)
 
     @property

@@ -37,10 +37,7 @@ RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Query a drone's surroundings for maps; waits for the answers of its proxy.
-
-    ``given``: the scenery to use if the drone does not report any.
-    """
+    """Query a drone's surroundings from its proxy, and wait. ``given``: the scenery if the drone reports none."""
     read = _reader(drone)
     known = _known(read(WORLD))
     world = known or given
@@ -168,10 +165,7 @@ MAX_ASKING: Final = 4  #: maximum number of parallel requests to drones; each ma
 
 
 class WorldApi:
-    """The routes ``world``, ``way`` and ``preflight`` for each drone.
-
-    ``given``: the surroundings used for drones that report none.
-    """
+    """The routes ``world``, ``way`` and ``preflight`` of each drone. ``given``: the scenery if a drone reports none."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
         self._fleet = fleet
@@ -188,7 +182,6 @@ class WorldApi:
 
     @answered
     async def world(self, request: Request) -> Response:
-        """Respond with a drone's surroundings for maps."""
         return await self._ask(request, lambda drone: world_values(drone, self._given))
 
     @answered
@@ -199,7 +192,6 @@ class WorldApi:
 
     @answered
     async def preflight(self, request: Request) -> Response:
-        """Respond with the preflight checklist."""
         folder = self._recordings.folder
         station = self._fleet.stations.get(request.path_params["name"])
         ours = station is not None and bool(station.view.overview()["me"])

@@ -39,7 +39,6 @@ class MspDriver(Driver):
         self._link: MspLink | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the driver's capabilities."""
         return Capabilities(vehicle="msp", actions=ACTIONS, description=f"a flight controller on {self.options}")
 
     def _open(self, sink: Sink) -> None:
@@ -101,7 +100,6 @@ class MspDriver(Driver):
             return DriverParameters(self._setpoints).parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter."""
         link = self._link
         if link is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)

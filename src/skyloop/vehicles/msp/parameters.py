@@ -35,7 +35,6 @@ class MspOptions:
 
     @property
     def serial(self) -> bool:
-        """Whether the address is a serial port."""
         return self.port is None
 
     def __str__(self) -> str:
@@ -43,7 +42,6 @@ class MspOptions:
 
 
 def options_of(uri: VehicleUri) -> MspOptions:
-    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     rate = uri.number("rate", DEFAULT_RATE_HZ, minimum=20.0, maximum=250.0)
     override = uri.flag("override", default=False)

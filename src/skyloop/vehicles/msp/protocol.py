@@ -125,7 +125,6 @@ class MspSession(VehicleSession):
         return self._stick_frame(now_ns)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return diagnostics about the flight controller's settings and state."""
         if self.setup is None:
             unread = "the flight controller's settings have not been read"
             return [Diagnostic("settings", False, unread, "wait until its link is up, then check again", severe=True)]

@@ -73,8 +73,6 @@ UNSHOWN: Final = "the motors were stopped, and it is still armed: it can fly aga
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits for set-points."""
-
     tilt: float = 0.35  #: [rad]
     climb: float = 1.0  #: [m/s]
     yaw_rate: float = 1.75  #: [rad/s]
@@ -90,8 +88,6 @@ class Gains:
 
 
 class Phase(Enum):
-    """Phases of a flight."""
-
     STANDING = auto()  #: on the ground, or being flown by a pilot
     ARMING = auto()
     SPOOLING = auto()  #: armed, with the throttle rising
@@ -265,7 +261,6 @@ class SetpointController:
     # Reports -------------------------------------------------------------------------------------------------------
 
     def on_report(self, report: Report, now_ns: int) -> None:
-        """Handle the flight controller's latest report."""
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         self._cut = self._cut and report.armed is not False
@@ -305,7 +300,6 @@ class SetpointController:
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
 
     def on_motion(self, motion: Motion) -> None:
-        """Handle a new motion estimate."""
         self._motion = motion
 
     def lost(self) -> None:

@@ -267,7 +267,6 @@ class MotionEstimate:
         self._ground[source] = before_m + (height_m - before_m) / self._stood
 
     def at(self, now_ns: int) -> Motion:
-        """Return the present motion."""
         yaw = self._heading_rad
         if yaw is not None and self._turned_rad is not None:
             yaw = wrap_angle(yaw + self._turned_rad)

@@ -249,7 +249,6 @@ class TelloSession(VehicleSession):
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return preflight findings based on the drone's latest state."""
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:

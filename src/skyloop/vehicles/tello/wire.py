@@ -119,7 +119,6 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Return the format of a command's reply."""
     return READ.get(command, Shape.OK)
 
 

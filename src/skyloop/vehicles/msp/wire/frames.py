@@ -31,8 +31,6 @@ _V2: Final = struct.Struct("<BHH")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An MSP frame."""
-
     function: int  #: 0 to 65535; 255 and greater only in version 2
     payload: bytes = b""  #: at most 65535 bytes
     direction: Direction = Direction.REQUEST
