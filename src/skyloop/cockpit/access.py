@@ -250,7 +250,7 @@ class TokenGate:
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
-        """Begin a session and return its cookie; drop the oldest if there are too many. ``token``: its token."""
+        """Begin a session and return its cookie; drop the oldest if there are too many. ``token``: its origin."""
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
         while len(self._sessions) >= MAX_SESSIONS:

@@ -104,7 +104,7 @@ class FollowSession:
     # Requests from the page ------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
-        """Keep a camera's frames until a box arrives or the page cancels; raise ``UnknownNameError`` without it."""
+        """Keep a camera's frames until a box arrives or the page cancels; raise ``UnknownNameError`` if unknown."""
         if self._keeper is not None:
             self._keeper.close()
             self._keeper = None

@@ -263,7 +263,7 @@ class Station:
     # Pilots ----------------------------------------------------------------------------------------------------
 
     async def open_pilot(self, app: str) -> PilotConnection:
-        """Open a pilot's connection, without authority; raise ``SkyloopError`` if this takes over :data:`PILOT_S`."""
+        """Open a pilot's connection, without authority; raise ``SkyloopError`` after :data:`PILOT_S`."""
 
         def connect() -> PilotConnection:
             return PilotConnection.open(self.found.dial, app, PILOT_S)

@@ -202,7 +202,7 @@ class AuthorityReport:
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
-        """Return the message for the page; None if nothing has changed. ``place``: in the queue, while it waits."""
+        """Return the message for the page, or None if unchanged. ``place``: its position in the queue, if any."""
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
         next_owner: str | None = None  # name of the first application in the queue, which may be a program
