@@ -3,7 +3,7 @@
 /** The address of the overview; no drone can have this name. */
 export const OVERVIEW = "#/";
 
-/** The drones that an address names; none: the overview. */
+/** The drones that an address names; none for the overview. */
 export function namesOf(hash: string): string[] {
   const text = hash.replace(/^#/, "");
   if (text.startsWith("/")) return [];

@@ -13,7 +13,7 @@ const RANKS = { warning: 1, critical: 2 } as const;
 
 interface Entry {
   rank: number;
-  /** The rank up to which it was acknowledged; 0: not at all. */
+  /** The rank up to which it was acknowledged; 0 if not at all. */
   acknowledged: number;
   raised_ms: number;
   seen_ms: number;
@@ -29,7 +29,7 @@ export class AlarmBook {
   private alarms: readonly Alarm[] = [];
   private readonly entries = new Map<string, Entry>();
 
-  /** The most severe alarm not acknowledged; null: none. */
+  /** The most severe alarm not acknowledged; null if there is none. */
   get loudest(): Alarm["severity"] | null {
     return this.open.some((alarm) => alarm.severity === "critical") ? "critical" : this.open.length ? "warning" : null;
   }
@@ -50,7 +50,7 @@ export class AlarmBook {
     this.sort();
   }
 
-  /** Whether it was shown long enough to be read. */
+  /** Acknowledge an alarm; returns false if it was shown too briefly to be read. */
   acknowledge(id: string, now_ms: number): boolean {
     const entry = this.entries.get(id);
     if (entry === undefined || now_ms - entry.raised_ms < READ_MS) return false;
@@ -106,7 +106,7 @@ export class AlarmBanner {
     return this.chip.getAttribute("aria-expanded") === "true";
   }
 
-  /** How many fit into the line; a page that shows old data needs the line for that. */
+  /** How many alarms the line shows; 0 while it shows that the data is old. */
   room = 1;
 
   show(): void {

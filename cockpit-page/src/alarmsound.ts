@@ -7,7 +7,8 @@ import { settings } from "./settings.js";
 
 type Severity = Alarm["severity"];
 
-const LOOK_MS = 250;
+/** Interval between checks. */
+const CHECK_MS = 250;
 /** A critical alarm repeats until it is acknowledged; a warning sounds once. */
 export const REPEAT_MS = 2500;
 const VIBRATIONS: Readonly<Record<Severity, number[]>> = { warning: [180], critical: [400, 150, 400, 150, 400] };
@@ -17,6 +18,7 @@ const TONES: Readonly<Record<Severity, readonly (readonly [number, number])[]>> 
   critical: [[988, 0], [740, 0.16], [988, 0.32], [740, 0.48], [988, 0.64]],
 };
 const TONE_S = 0.13;
+/** From 0 to 1. */
 const VOLUME = 0.25;
 
 /** A source of alarms: an open drone, or the whole list. */
@@ -57,11 +59,11 @@ export class AlarmSound {
   constructor(private readonly sources: () => readonly AlarmSource[]) {
     const picture = svg("svg", { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { d: "M2 6v4h2.6L9 13.4V2.6L4.6 6z", fill: "currentColor" }), this.wave);
     this.button = h("button", { type: "button", class: "small sound", onclick: () => this.mute(!this.isMuted) }, picture, this.text);
-    // Browsers allow sound only after the first touch of the page.
-    // At the end of a press: the text changes the button's width, and nothing may move under a pressed finger.
+    // Browsers allow sound only after the first touch of the page. Wait for the end of the press, because the text changes
+    // the button's width, and nothing may move under a finger.
     for (const touch of ["pointerup", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
     settings.on("sound", () => this.show());
-    setInterval(() => this.look(), LOOK_MS);
+    setInterval(() => this.check(), CHECK_MS);
     this.show();
   }
 
@@ -78,11 +80,11 @@ export class AlarmSound {
     if (!muted) this.play("warning"); // a sample, so that the person knows the sound
   }
 
-  private look(): void {
+  private check(): void {
     const due = this.ringing.due(this.sources(), performance.now());
     this.show();
     if (due === null) return;
-    // Before the first touch, browsers also forbid this, and complain.
+    // Before the first touch, browsers also forbid vibrations, and log a complaint.
     if (navigator.userActivation?.hasBeenActive ?? true) navigator.vibrate?.(VIBRATIONS[due]);
     if (!this.isMuted) this.play(due);
   }
@@ -105,7 +107,7 @@ export class AlarmSound {
       tone.type = "square";
       tone.frequency.value = frequency;
       volume.gain.setValueAtTime(0, at_s);
-      volume.gain.linearRampToValueAtTime(VOLUME, at_s + 0.01); // without a click
+      volume.gain.linearRampToValueAtTime(VOLUME, at_s + 0.01); // ramps avoid clicks
       volume.gain.setValueAtTime(VOLUME, at_s + TONE_S - 0.02);
       volume.gain.linearRampToValueAtTime(0, at_s + TONE_S);
       tone.connect(volume).connect(context.destination);

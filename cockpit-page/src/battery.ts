@@ -4,7 +4,6 @@ import { h, setAttribute, setText, setTone, svg } from "./dom.js";
 import { t } from "./language/index.js";
 import type { Alarm } from "./model.js";
 
-
 export class Battery {
   readonly element: HTMLElement;
   private readonly level = svg("rect", { class: "battery-level", x: 2.5, y: 2.5, width: 0, height: 7, rx: 1 });

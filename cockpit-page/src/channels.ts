@@ -38,7 +38,7 @@ export class Channels {
   }
 }
 
-/** Milliseconds, with one decimal while it matters. */
+/** Milliseconds, with a decimal below 10 ms; seconds from 10 s. */
 export function milliseconds(seconds: Known): string {
   if (seconds === null || seconds === undefined) return "–";
   if (Math.abs(seconds) >= 10) return `${figure(seconds, 0)} s`;

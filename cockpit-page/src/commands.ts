@@ -9,12 +9,13 @@ import type { Handlers } from "./socket.js";
 
 /** An older command is not executed [ms]. */
 export const LATE_MS = 500;
-/** Nor is an emergency stop older than this. */
+/** An emergency stop older than this is not executed. */
 export const STOP_LATE_MS = 2000;
-/** After this long without a pong the link counts as dead, and the data shown as old. */
+/** After this long without a pong, the link counts as dead and the data shown as old. */
 export const STALE_MS = 1000;
-/** The answer may take as long again. */
+/** How long to wait for an answer once a command is too old to be executed. */
 const ANSWER_MS = 1000;
+// How long an outcome is shown.
 const SENT_SHOWN_MS = 2500;
 const FAILED_SHOWN_MS = 8000;
 const STOPS: ReadonlySet<string> = new Set(["stop", "stop_all"]);
@@ -75,7 +76,7 @@ export class CommandSender {
   private answered_s: number | null = null;
   private readonly pings = new Map<number, number>();
   private readonly pending = new Map<string, Pending>();
-  private readonly settled = new Map<string, number>(); // numbers of the newest ones
+  private readonly settled = new Map<string, number>(); // number of the newest settled command of each kind
   private readonly results = new Map<string, Result & { since_ms: number }>();
 
   constructor(

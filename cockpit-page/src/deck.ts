@@ -1,4 +1,4 @@
-// Panels that share one place: buttons select the visible one. Plain buttons, not tabs, as arrow keys are for flying.
+// Panels that share one place: buttons select the visible one. They are not tabs, because arrow keys are for flying.
 
 import { h, memory, setAttribute } from "./dom.js";
 

@@ -84,7 +84,7 @@ function label(pen: CanvasRenderingContext2D, text: string, at: [number, number]
   pen.textBaseline = "middle";
   const width = pen.measureText(text).width;
   const inset = 7 * density;
-  // Kept inside the picture, and below the line with its age.
+  // Keep the label inside the picture, and below the line that shows the picture's age.
   const within = (value: number, least: number, most: number): number => Math.max(least, Math.min(value, most));
   const x = within(at[0], fit.x + 2 * inset, fit.x + fit.width - width - 2 * inset);
   const y = within(at[1], fit.y + 48 * density, fit.y + fit.height - 15 * density);

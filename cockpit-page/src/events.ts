@@ -8,7 +8,7 @@ import type { DroneEvent } from "./model.js";
 const MOST_EVENTS = 300;
 const TONES: Readonly<Record<string, Tone>> = { info: "quiet", warning: "warn", error: "bad" };
 
-/** The newest first; words and severity filter the list. */
+/** The list of events, newest first, filtered by words and severity. */
 export class Events {
   readonly element: HTMLElement;
   private readonly list = h("ol", { class: "events", tabindex: 0, "aria-label": t.events.label });
@@ -22,7 +22,7 @@ export class Events {
     this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, this.severity), this.list, this.none);
   }
 
-  /** Returns the new ones. */
+  /** Add events that are not listed yet; returns them. */
   add(events: readonly DroneEvent[]): DroneEvent[] {
     const fresh = events.filter((event) => event.n > this.newest);
     for (const event of fresh) {

@@ -25,7 +25,7 @@ export class FlightMode {
   private isFull = false;
   private lock: WakeLockSentinel | null = null;
 
-  /** @param rest Called so that nothing held counts any more: everything under a finger has moved. */
+  /** @param rest Makes held keys and sticks count for nothing, because everything under a finger has moved. */
   constructor(private readonly rest: () => void) {
     window.addEventListener("popstate", () => {
       this.pushed = false;
@@ -37,14 +37,14 @@ export class FlightMode {
     window.matchMedia("(orientation: portrait)").addEventListener("change", () => this.pane && this.rest());
     document.addEventListener("visibilitychange", () => !document.hidden && this.pane && void this.keepAwake());
     document.addEventListener("fullscreenchange", () => {
-      // Escape, and Back on a phone, first end the full screen and are not seen here: they mean both.
+      // Escape, and Back on a phone, end the full screen without an event of their own: the person means both.
       if (this.isFull && document.fullscreenElement === null) this.leave();
       this.isFull = this.pane !== null && document.fullscreenElement === document.documentElement;
       this.show();
     });
   }
 
-  /** By the person, whose press lets the browser show it full screen; or automatically on a phone. */
+  /** Enter flight mode. Only if a person pressed for it does the browser allow full screen. */
   enter(pane: FlightPane, byPerson: boolean): void {
     if (this.pane === pane) return;
     this.end();
@@ -58,7 +58,7 @@ export class FlightMode {
     void this.keepAwake();
   }
 
-  /** A drone was opened: on a phone it is flown at once. */
+  /** A drone was opened: on a phone, enter flight mode. */
   offer(pane: FlightPane): void {
     if (this.pane === null && window.matchMedia(TELEPHONE).matches) this.enter(pane, false);
   }
@@ -79,7 +79,7 @@ export class FlightMode {
     if (this.pane === pane) this.end();
   }
 
-  /** Without the browser's bars, where the browser supports it: Safari on an iPhone shows it between them. */
+  /** Hide the browser's bars, where the browser supports it; Safari on an iPhone keeps them. */
   fillScreen(): void {
     void document.documentElement.requestFullscreen?.({ navigationUI: "hide" }).catch(() => undefined);
   }
@@ -102,7 +102,7 @@ export class FlightMode {
     setAttribute(document.documentElement, "data-full", String(document.fullscreenElement !== null || !document.fullscreenEnabled));
   }
 
-  /** A dark screen hides the page, and the drone then hovers: safe, but a surprise. */
+  /** Keep the screen on: when it turns off, the page is hidden and the drone hovers, which is safe but surprising. */
   private async keepAwake(): Promise<void> {
     const { pane } = this;
     try {

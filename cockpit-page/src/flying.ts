@@ -10,7 +10,7 @@ import { settings } from "./settings.js";
 import { CENTRED, type Hands, PACES, type Pace, scale } from "./sticks.js";
 import type { Thumbs } from "./thumbs.js";
 
-/** A page suspended for this long, as in the browser's cache or a sleeping computer, does not know what hands did meanwhile. */
+/** A page that was suspended for this long, in the browser's cache or by a sleeping computer, can't know what hands did. */
 const STOOD_STILL_MS = 1000;
 
 /** One drone that this page may fly, and the state of the hands on it. */
@@ -30,7 +30,7 @@ export interface Cabin {
   selected(): Flown | null;
   /** An action by key or gamepad, for the selected drone. */
   act(deed: Deed): void;
-  /** The emergency stop is held by keys or gamepad: for the visible drone, or all; null: released. */
+  /** The emergency stop is held by keys or gamepad, for the selected drone or for all; null when it is released. */
   hold(which: "one" | "all" | null): void;
   /** The present state of the inputs. */
   inputs(view: InputView): void;

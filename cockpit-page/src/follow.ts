@@ -14,10 +14,10 @@ export interface Size {
 export type FollowMode = "follow" | "orbit" | "look";
 export const FOLLOW_MODES: readonly FollowMode[] = ["follow", "orbit", "look"];
 
-/** The cockpit's report on it: docs/cockpit.md. */
+/** The cockpit's report on a target (docs/cockpit.md). */
 export interface FollowMessage {
   type: "follow";
-  /** `selecting`: frames are kept since `since_ns`. `tracking`: not flying. `waiting`: hovering, as no frames arrive. */
+  /** `selecting`: frames are kept since `since_ns`. `tracking`: not flying. `waiting`: hovering, for the reason in `problem`. */
   state: "selecting" | "tracking" | "flying" | "waiting" | "ended";
   camera: string;
   since_ns?: string;
@@ -99,13 +99,13 @@ function nameIn(shape: Shape | undefined): string {
   return shape?.kind === "text" ? (NAMED.exec(shape.text)?.[1] ?? "") : "";
 }
 
-/** The smallest one that contains a place; null: none. */
+/** The smallest detection that contains a place; null if there is none. */
 export function foundAt(all: readonly Found[], [px, py]: Point): Found | null {
   const hit = all.filter(({ box: [x, y, width, height] }) => px >= x && px <= x + width && py >= y && py <= y + height);
   return hit.reduce<Found | null>((best, one) => (best === null || one.box[2] * one.box[3] < best.box[2] * best.box[3] ? one : best), null);
 }
 
-/** A box moved, or resized around its centre, within the frame; at first one in the centre. */
+/** A box moved, or resized around its centre, within the frame; without a box, one in the centre. */
 export function nudged(box: Box | null, [right, down]: Point, grows: boolean, { width, height }: Size): Box {
   if (box === null) return [width * 0.4, height * 0.3, width * 0.2, height * 0.4];
   const [dx, dy] = [right * width * 0.02, down * height * 0.02];

@@ -66,14 +66,14 @@ export class FollowPanel {
     this.height = 0;
   }
 
-  /** The reason why nothing can be flown now; empty: it can. */
+  /** Set the reason why nothing can be flown now; empty if it can. */
   allow(why: string): void {
     this.can = why;
     for (const mode of FOLLOW_MODES) setDisabled(this.modes[mode], why !== "" || this.unread !== null);
     this.explain();
   }
 
-  /** It can be chosen from now on, also by Enter if the focus was not moved meanwhile. */
+  /** Modes can be chosen from now on, also by Enter unless the focus has moved meanwhile. */
   private read(): void {
     if (this.unread === null) return;
     clearTimeout(this.unread);
@@ -98,7 +98,7 @@ export class FollowPanel {
     this.explain();
   }
 
-  /** It stays in place unless it grows. */
+  /** Place the panel; it stays where it is until its height changes. */
   private place(): void {
     const { offsetWidth: width, offsetHeight: height } = this.element;
     if (this.at === null || height === this.height) return;

@@ -24,7 +24,7 @@ export interface FollowView {
 }
 
 export interface FollowHost {
-  /** Keep a camera's frames while a box is drawn; null: stop keeping them. */
+  /** Keep a camera's frames while a box is drawn; null to stop keeping them. */
   select(camera: string | null): void;
   mark(mark: Mark): void;
   go(mode: FollowMode, distance_m: number | null): void;
@@ -112,7 +112,7 @@ export class FollowTool {
     return false;
   }
 
-  /** Its view is closing. */
+  /** The tool's view is closing. */
   end(): void {
     if (this.state === "selecting") this.host.select(null);
     else if (this.state !== "off") this.host.stop();
@@ -290,7 +290,7 @@ export class FollowTool {
     document.removeEventListener("visibilitychange", this.hidden);
   }
 
-  /** Before Escape leaves the flight mode. It does not stop a flight, as it also closes dialogs. */
+  /** Handle Escape before flight mode does. It does not stop a flight, because it also closes dialogs. */
   private onEscape(event: KeyboardEvent): void {
     if (event.code !== "Escape" || isModalOpen() || this.state === "flying") return;
     event.preventDefault();

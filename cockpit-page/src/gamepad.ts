@@ -19,7 +19,7 @@ export interface Pad {
 export interface PadReading {
   sticks: Sticks;
   deeds: Deed[];
-  /** Its name; null without one. */
+  /** The gamepad's name; null without a gamepad. */
   name: string | null;
   /** The buttons of the emergency stop are pressed; it must be held. */
   stops: boolean;
@@ -35,7 +35,7 @@ export function plugged(): Pad[] {
   return (navigator.getGamepads?.() ?? []).filter((pad): pad is Gamepad => pad?.connected ?? false).sort((a, b) => Number(b.mapping === "standard") - Number(a.mapping === "standard"));
 }
 
-/** What its axes fly: as assigned, else by the mode if browsers know its layout, else nothing. */
+/** The axes that fly each direction: as assigned, or by the mode if browsers know the gamepad's layout, or none. */
 export function sources(pad: Pad, map: PadMap, mode: Values["mode"]): Readonly<Record<Axis, Source | null>> {
   const none = { forward: null, left: null, up: null, yaw_rate: null };
   return map.sources ?? (pad.mapping === "standard" ? sourcesOf(mode) : none);

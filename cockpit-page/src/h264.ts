@@ -69,7 +69,7 @@ const browser: Codecs<VideoFrame> = {
   cancel: (timer) => clearTimeout(timer as number),
 };
 
-/** The proxy's encoding: Main profile; any level. */
+/** The proxy's encoding, Main profile, to ask whether the browser decodes it; the level does not matter. */
 const COMMON = "avc1.4D4028";
 /** A decoder without output for this long is restarted [ms]. */
 export const PATIENCE_MS = 1000;

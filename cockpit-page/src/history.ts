@@ -1,7 +1,8 @@
 // The data behind plots and maps: every number received, and the drone's path. Pure.
 
+/** How long the drone's path is kept, and the longest time that a plot shows. */
 export const KEPT_S = 120;
-/** Takes the present rate and more: the arrays never move. */
+/** Number of samples: more than `KEPT_S` of states. The arrays have this size from the start. */
 const CAPACITY = 4096;
 
 /** Numbers by name over one time axis; the oldest are overwritten. Missing values are NaN. */
@@ -11,7 +12,7 @@ export class History {
   private readonly series = new Map<string, Float32Array>();
   private written = 0;
 
-  /** `at_s` of a clock that never goes back. */
+  /** Add values at a time; times must never go back. */
   add(at_s: number, values: Readonly<Record<string, number | null>>): void {
     const slot = this.written % CAPACITY;
     this.times[slot] = at_s;
@@ -58,7 +59,7 @@ export class History {
   }
 }
 
-/** The path: a point for each step, none older than requested. */
+/** The drone's path: a point for each `step_m`, none older than `kept_s`. */
 export class Trail {
   points: { at_s: number; place: readonly [number, number, number] }[] = [];
 

@@ -3,8 +3,9 @@
 import { h, setAttribute, setText } from "./dom.js";
 import { t } from "./language/index.js";
 
-/** How long it is held [ms]. */
+/** How long the emergency stop must be held. */
 export const HOLD_MS = 800;
+/** How long the hint is shown after an early release. */
 const HINT_MS = 1500;
 
 /** The outcome of a held press. Pure. */
@@ -64,7 +65,7 @@ export class Countdown {
     return this.hold.isHeld;
   }
 
-  /** Whether this one is held, not one that began elsewhere: a hold is ended only by its own origin. */
+  /** Whether this hold is under way, not one that began elsewhere: only its own origin may end a hold. */
   holds(deadly: Deadly | null): boolean {
     return deadly !== null && this.held === deadly;
   }

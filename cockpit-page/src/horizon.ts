@@ -7,10 +7,10 @@ import { t } from "./language/index.js";
 import type { State } from "./model.js";
 import { unit } from "./units.js";
 
-const PITCH = 3.1; // units of the drawing per degree
+const PITCH = 3.1; // units of the drawing per degree of pitch
 const [LEFT, RIGHT, TOP, BOTTOM] = [56, 264, 6, 186];
 const [MID_X, MID_Y] = [(LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2];
-const DESCRIBED_MS = 2000;
+const DESCRIBED_MS = 2000; // interval between descriptions for screen readers
 
 /** A scale that moves behind a mark. Its few labels are reused. */
 class Tape {

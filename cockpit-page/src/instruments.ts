@@ -9,6 +9,7 @@ import { inUnit, unit } from "./units.js";
 
 const LINK_TONES: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 const FIGURES = ["altitude", "climb", "speed", "heading", "roll", "pitch"] as const;
+/** A longer round trip to the cockpit is shown as a warning. */
 const SLOW_S = 0.25;
 
 class Hop {

@@ -37,10 +37,10 @@ import { LastingSocket } from "./socket.js";
 import { followTheme } from "./settings.js";
 import type { Own } from "./tile.js";
 
-const DRAW_MS = 45;
+const DRAW_MS = 45; // interval between drawings
 /** The list of drones arrives twice a second; when older than this it is grey [ms]. */
 const OLD_LIST_MS = 2000;
-/** In lower windows, as of a page enlarged to 400 %, only the safety controls of the bar stay in sight. */
+/** In windows lower than this, such as a page enlarged to 400 %, only the safety controls of the bar stay in sight. */
 const LOW_PX = 500;
 
 const isFlown = (pane: Pane): pane is Pane & Flown => pane.pilot !== null;
@@ -121,7 +121,7 @@ class Page {
       message: (data) => this.see(JSON.parse(data as string) as { now_s: number; drones: DroneRow[] }),
       state: (open, code) => this.linked(open, code),
     });
-    // All at once, and no faster than states arrive: painting is the largest cost.
+    // Draw everything at once, and hardly more often than states arrive: painting is the largest cost.
     let drawn_ms = 0;
     const draw = (now_ms: number): void => {
       requestAnimationFrame(draw);

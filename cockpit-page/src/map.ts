@@ -9,12 +9,12 @@ import { lengthText } from "./units.js";
 import { apart, around, gridStep, type Size, toMetres, toPixels, type View, zoomed } from "./view.js";
 import type { Scene } from "./world.js";
 
-const PERIOD_MS = 80;
-const CLICK_PX = 5;
-const REACH_PX = 12;
+const PERIOD_MS = 80; // interval between drawings
+const CLICK_PX = 5; // a press that moves less is a click
+const REACH_PX = 12; // things this close count as under the pointer
 const EASE = 0.15; // share of the way to the desired view, per drawing
 const STILL = 0.01; // share of the view's extent: a smaller distance counts as no movement
-const ZOOM = 1.4;
+const ZOOM = 1.4; // factor of a press or key
 const INKS = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "target"];
 
 interface Shown {

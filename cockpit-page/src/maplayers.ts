@@ -117,7 +117,7 @@ function path({ pen, ink, at }: Chart, places: readonly (readonly number[])[], e
   pen.globalAlpha = 1;
 }
 
-/** From the drone over its waypoints. */
+/** The way from the drone via its waypoints. */
 function way({ pen, ink, at }: Chart, scene: Scene): void {
   if (!scene.own || !scene.waypoints.length) return;
   pen.beginPath();

@@ -20,7 +20,7 @@ export interface MapHost {
   /** Fly along a checked route, and control that flight. */
   flyRoute(id: string): void;
   steerRoute(deed: RouteDeed): void;
-  /** Write a parameter; returns the reason of a refusal, empty if written. */
+  /** Write a parameter; returns the reason for a refusal, empty if it was written. */
   write(name: string, value: string | number): Promise<string>;
 }
 
@@ -72,7 +72,7 @@ export class MapPanel {
     if (only) this.map.use(null);
   }
 
-  /** The reasons why it can't be flown to a place now, and why no zone can be written; empty: it can. */
+  /** Set why the drone can't be flown to a place now, and why no zone can be written; each is empty if it can. */
   allow(fly: string, write: string): void {
     this.why = { fly, write };
     this.waypoint.allow(fly === "");

@@ -16,7 +16,7 @@ export interface Spot {
   pixel: [number, number];
   /** Anything within this distance counts as under it [m]. */
   reach_m: number;
-  /** The drone or target under it, the nearest first; null: none. */
+  /** The nearest drone or target under it; null if there is none. */
   under: Body | null;
 }
 
@@ -46,7 +46,7 @@ const ARROWS: Readonly<Record<string, readonly [number, number]>> = { ArrowUp: [
 /** How far an arrow key moves the cursor, east and north, in steps; null for another key. */
 export const arrow = (code: string): readonly [number, number] | null => ARROWS[code] ?? null;
 
-/** The nearest thing to a place within a distance [m]; null: none. */
+/** The nearest thing to a place within a distance [m]; null if there is none. */
 export function nearest<T extends { position: readonly number[] }>(place: readonly [number, number], reach_m: number, all: readonly T[]): T | null {
   let best: T | null = null;
   let least = reach_m;

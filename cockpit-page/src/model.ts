@@ -90,7 +90,7 @@ export interface Place {
 
 export interface State {
   type: "state";
-  /** Time of making, on the cockpit's clock. */
+  /** When the cockpit made it, on the cockpit's clock. */
   now_s: number;
   links: Links;
   feedback: { age_s: number | null; failsafe: string } | null;
@@ -147,18 +147,18 @@ export interface Authority {
   app: string;
   /** This page's place in the queue; null while it is not waiting. */
   line: QueuePosition | null;
-  /** The pages of this cockpit that wait for control, by the names that others see; including this one. */
+  /** Those that wait for control, by the names that others see: this cockpit's pages, and another application if it is first. */
   waiting: readonly string[];
 }
 
 export interface QueuePosition {
   /** 1 is next. */
   position: number | null;
-  /** Expected at the time of sending. */
+  /** Expected wait at the time of sending. */
   wait_s: number | null;
-  /** The holder was asked first, */
+  /** Whether the holder was asked first. */
   asked: boolean;
-  /** and keeps control for this reason, which may be empty. */
+  /** The holder's reason for keeping control, which may be empty; null if it did not decline. */
   declined: string | null;
 }
 
@@ -171,7 +171,7 @@ export interface Question {
   for_s: number | null;
   /** Time left to answer when it was sent; then a higher priority gets control. */
   left_s: number;
-  /** By this page. */
+  /** Whether this page declined it. */
   declined: boolean;
 }
 

@@ -1,5 +1,5 @@
-// The functions of a gamepad's sticks and buttons: shown as they move, and changed. While it is open the gamepad commands
-// nothing at all, not even the emergency stop: use its keys and its button on the screen.
+// The functions of a gamepad's sticks and buttons: shown as they move, and changed. While this dialog is open, the gamepad
+// commands nothing at all, not even the emergency stop, which has keys and a button on the screen.
 
 import { h, memory, setAttribute, setHidden, setText, svg } from "./dom.js";
 import { type Pad, plugged, pressedOf, sources } from "./gamepad.js";
@@ -206,7 +206,7 @@ class DeedRow {
   }
 }
 
-const TRAVEL = 13;
+const TRAVEL = 13; // how far the picture's sticks move
 /** The position of each button of the standard layout: x, y and radius, or width for bars. */
 const BUTTONS: readonly { x: number; y: number; radius?: number; width?: number }[] = [
   { x: 244, y: 92, radius: 9 }, { x: 264, y: 73, radius: 9 }, { x: 224, y: 73, radius: 9 }, { x: 244, y: 54, radius: 9 },
@@ -216,7 +216,7 @@ const BUTTONS: readonly { x: number; y: number; radius?: number; width?: number 
   { x: 76, y: 58, radius: 7 }, { x: 76, y: 90, radius: 7 }, { x: 60, y: 74, radius: 7 }, { x: 92, y: 74, radius: 7 },
   { x: 160, y: 50, radius: 8 },
 ];
-const LABELLED = 8;
+const LABELLED = 8; // number of buttons with a label: those in front
 
 export class PadPicture {
   readonly element: HTMLElement;

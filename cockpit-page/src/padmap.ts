@@ -31,7 +31,7 @@ export const PAD_DEEDS: readonly PadDeed[] = ["stop", "takeoff", "hover", "land"
 /** Without a dead zone a worn stick would never be at rest. */
 export const DEAD_ZONES = { minimum: 0.05, maximum: 0.5 } as const;
 const MOST = 64; // axes and buttons of a gamepad
-const MOVED = 0.6;
+const MOVED = 0.6; // a smaller movement of an axis may be an accident
 
 const CURVE: Curve = { deadZone: DEAD_BAND, expo: 0 };
 export const STANDARD_MAP: PadMap = {

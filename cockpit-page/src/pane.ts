@@ -57,7 +57,7 @@ export interface PaneHost {
   readonly countdown: Countdown;
 }
 
-const NOTICE_MS = 9000;
+const NOTICE_MS = 9000; // how long a message is shown
 /** A first connection that takes longer raises an alarm. */
 const CONNECT_MS = 1500;
 const FLIGHT_TONES: Readonly<Record<string, Tone>> = { landed: "quiet", unknown: "quiet", emergency: "bad", landing: "busy", taking_off: "busy", hovering: "ok", flying: "ok" };
@@ -70,7 +70,6 @@ export class Pane {
   readonly said = h("div", { class: "said" });
   private vehicle: Vehicle | null = null;
   private state: State | null = null;
-  /** Its position when it was first seen in the air, in this flight. */
   private connected = false;
   private absent = "";
   private dirty = false;
@@ -217,7 +216,7 @@ export class Pane {
     setAttribute(this.element, "data-picture", String(alone && !panels));
   }
 
-  /** With the picture first: it, or the map, is the large one. */
+  /** Make the picture or the map the large one. */
   private enlarge(what: string): void {
     memory.set("large", what);
     setAttribute(this.element, "data-large", what);
@@ -228,7 +227,7 @@ export class Pane {
     setAttribute(this.swap, "aria-label", what === "map" ? t.pane.pictureLarge : t.pane.mapLarge);
   }
 
-  /** For the flight mode, or as usual. */
+  /** Lay it out for flight mode, or as usual. */
   arrange(flight: boolean): void {
     setAttribute(this.element, "data-flight", String(flight));
     setAttribute(this.fly, "aria-pressed", String(flight));
@@ -250,7 +249,7 @@ export class Pane {
     else if (deed !== "takeoff" || this.mayTakeOff()) this.pilot.act(deed);
   }
 
-  /** False: the pilot must confirm, because of a finding. */
+  /** False if the pilot must confirm first, because of a finding. */
   private mayTakeOff(): boolean {
     const question = this.state?.flight === "landed" ? this.preflight.ask(performance.now()) : "";
     if (question) this.notify(question, "bad");

@@ -50,7 +50,7 @@ export function rangeText(parameter: Pick<Parameter, "minimum" | "maximum" | "ch
   return maximum === null ? "" : `≤ ${plain(maximum)}`;
 }
 
-/** Only some of them, with the text for none, and the name of the list. */
+/** Limits a list to some parameters; also the text shown if there are none, and the name of the list. */
 export interface Choice {
   has(name: string): boolean;
   none: string;
@@ -88,7 +88,7 @@ export class Parameters {
     this.element = h("div", { class: "filling" }, choice ? null : h("div", { class: "filters" }, this.words, again), this.note, this.list);
   }
 
-  /** Whether they can be written now; `why` not. */
+  /** Set whether parameters can be written now; `why`: the reason if not. */
   allow(can: boolean, why: string): void {
     this.can = can;
     setText(this.note, can ? "" : why);
@@ -206,13 +206,14 @@ function editorOf(parameter: Parameter): Editor {
 
 const ANSWER_MS = 4000;
 
+/** Writes parameters one after another, because a refusal does not name its parameter. */
 export class Writes {
   private under: { name: string; done: (why: string) => void } | null = null;
   private last: Promise<unknown> = Promise.resolve();
 
   constructor(private readonly send: (name: string, value: string | number) => void) {}
 
-  /** Returns the reason of a refusal; empty if it was written. */
+  /** Returns the reason for a refusal; empty if it was written. */
   write(name: string, value: string | number): Promise<string> {
     const answer = this.last.then(() => this.one(name, value));
     this.last = answer;
@@ -224,7 +225,7 @@ export class Writes {
     return this.end(this.under?.name === name, "");
   }
 
-  /** A refusal names no parameter: it concerns the write under way. */
+  /** A write was refused. Returns whether one was under way here. */
   refused(why: string): boolean {
     return this.end(this.under !== null, why);
   }

@@ -13,9 +13,10 @@ import type { RouteProgress } from "./route.js";
 import type { Handlers } from "./socket.js";
 import { isCentred } from "./sticks.js";
 
+/** Interval between stick commands. */
 export const STEER_MS = 50;
-const ALIVE_MS = 150;
-const WATCH_MS = 300; // often enough to notice data older than a second
+const ALIVE_MS = 150; // interval between pings while this page has control
+const WATCH_MS = 300; // interval between other pings; often enough to notice data older than a second
 
 export interface PilotListener {
   /** The holder of control, its applicants, or the connection has changed. */
@@ -149,12 +150,12 @@ export class Pilot {
     this.send({ do: deed });
   }
 
-  /** A box is about to be drawn on a frame of this camera; null: no longer. */
+  /** A box is about to be drawn on a frame of this camera; null if no longer. */
   selectTarget(camera: string | null): void {
     this.send({ do: "follow_select", camera });
   }
 
-  /** Track it without flying. */
+  /** Track a target without flying. */
   markTarget(mark: Mark): void {
     this.send({ do: "follow", ...mark });
   }
@@ -220,7 +221,7 @@ export class Pilot {
     return sent;
   }
 
-  /** Whether an answer concerns this page's present flight, not a flight that it replaced; 0: the answer does not say. */
+  /** Whether an answer concerns this page's present flight, not one that it replaced; true if the answer has no number. */
   private isNewest(n?: number): boolean {
     return !n || !this.flight || n === this.flight;
   }

@@ -6,10 +6,10 @@ import { figure, plain, short } from "./format.js";
 import type { History } from "./history.js";
 import { t } from "./language/index.js";
 
-const COLOURS = 8;
-const FIRST = ["altitude", "velocity.forward", "velocity.left"];
+const COLOURS = 8; // in the style sheet, and therefore the maximum number of plots
+const FIRST = ["altitude", "velocity.forward", "velocity.left"]; // plotted until the person chooses
 const SPANS_S = [10, 30, 60, 120];
-const PERIOD_MS = 120;
+const PERIOD_MS = 120; // interval between drawings
 /** Numbers of programs and drivers, which may be small and still significant. */
 const OF_ANY_SIZE = /^(log|native)\./;
 

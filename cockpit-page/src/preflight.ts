@@ -14,6 +14,7 @@ export interface Finding {
 
 /** Older findings say nothing about now. */
 const OLD_MS = 45_000;
+/** Interval between checks before a flight. */
 const AGAIN_MS = 15_000;
 /** A second take-off within this time answers the question. */
 const ANSWER_MS = 8000;
@@ -27,7 +28,7 @@ export class TakeOffQuestion {
   private asked_ms = Number.NEGATIVE_INFINITY;
   private asked = "";
 
-  /** The question, in words; empty: take off. */
+  /** The question, in words; empty if the drone should take off now. */
   ask(findings: readonly Finding[], age_ms: number, now_ms: number): string {
     const against = age_ms > OLD_MS ? [] : findings.filter(({ level }) => level === "fail");
     const words = against.map(({ check, detail, why }) => `${check}: ${detail}${why ? ` – ${why}` : ""}`).join("; ");
@@ -63,7 +64,7 @@ export class Preflight {
     if (about && now_ms - this.tried_ms > AGAIN_MS) void this.load();
   }
 
-  /** The question before a take-off; empty: take off. */
+  /** The question before a take-off; see `TakeOffQuestion.ask`. */
   ask(now_ms: number): string {
     return this.question.ask(this.findings, now_ms - this.read_ms, now_ms);
   }

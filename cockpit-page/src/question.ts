@@ -9,17 +9,18 @@ import { t } from "./language/index.js";
 import type { Question } from "./model.js";
 import type { Pilot } from "./pilot.js";
 
+/** A question can't be answered earlier than this after it appeared. */
 export const UNREAD_MS = 600;
-const MOST_REASON = 200;
+const MOST_REASON = 200; // maximum length of a reason
 
 /** Who finally gets control, whatever the answer. */
 export const wins = (question: Question, own: number | null): boolean => own !== null && question.priority < own;
 
-/** The relevant ones: declined ones only as long as the higher priority is still to come. */
+/** The questions to show: a declined one only if its higher priority will get control anyway. */
 export const pending = (questions: readonly Question[], own: number | null): Question[] =>
   questions.filter((one) => !one.declined || wins(one, own));
 
-/** Its meaning, in sentences. `own`: the priority with which this page has control; `more`: how many others ask. */
+/** A question in sentences. `own`: the priority with which this page has control; `more`: how many others ask. */
 export function explained(question: Question, own: number | null, more: number): string {
   const others = more > 0 ? [t.question.more(more)] : [];
   if (question.declined) return [t.question.keepForNow, ...others].join(" ");

@@ -4,14 +4,14 @@
 const kept: HTMLElement[] = [];
 /** The original place of each, while it is elsewhere. */
 const homes = new Map<HTMLElement, Comment>();
-/** The newest has them. */
+/** The open dialogs and full screens; the newest holds the elements. */
 const hosts: HTMLElement[] = [];
 
 export function keepInReach(element: HTMLElement | null): void {
   if (element) kept.push(element);
 }
 
-/** Until `takeBack`, or until another one takes them. */
+/** Move the elements into a host, until `takeBack` or until another host takes them. */
 export function lend(host: HTMLElement): void {
   hosts.push(host);
   arrange();

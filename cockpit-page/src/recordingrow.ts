@@ -11,14 +11,14 @@ export interface RowHost {
   readonly pilots: boolean;
   /** The folder of the files. */
   folder(): string;
-  /** Do it, show errors, and refresh the list; `doing`: the text meanwhile, by the seconds passed. */
+  /** Do the work, show errors, and refresh the list; `doing` makes the text shown meanwhile from the seconds passed. */
   act(work: () => Promise<unknown>, doing?: (seconds: number) => string): Promise<boolean>;
   replayed(drone: string): void;
   /** It is in the trash, under this name. */
   thrown(name: string): void;
 }
 
-const TEXT = 4000;
+const TEXT = 4000; // maximum length of a note, as in recording_files.py
 
 export class RecordingRow {
   readonly element: HTMLElement;

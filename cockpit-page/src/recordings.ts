@@ -7,7 +7,7 @@ import { t } from "./language/index.js";
 import type { PastRecording, Recordings, RunningRecording } from "./model.js";
 import { RecordingRow } from "./recordingrow.js";
 
-const PERIOD_MS = 1000;
+const PERIOD_MS = 1000; // interval between requests while something is recorded
 const IDLE_PERIODS = 5; // poll less often while nothing is recorded
 const FEW = 3; // few enough to see at a glance
 
@@ -79,12 +79,12 @@ export class RecordingList {
     }
   }
 
-  /** The one that goes on of a drone. */
+  /** The running recording of a drone; null if there is none. */
   of(drone: string): RunningRecording | null {
     return this.goOn.find((one) => one.drones.includes(drone)) ?? null;
   }
 
-  /** Record a drone, or end that; what to say of it. */
+  /** Start or stop recording a drone; returns the message to show. */
   async toggle(drone: string): Promise<{ text: string; tone: Tone }> {
     const running = this.of(drone);
     let [text, tone]: [string, Tone] = ["", "ok"];
@@ -98,7 +98,7 @@ export class RecordingList {
     return { text, tone };
   }
 
-  /** What a press would record: a drone is recorded once at a time. */
+  /** The drones that a press would record: those that are not being recorded. */
   private get unrecorded(): string[] {
     return this.drones().filter((drone) => this.of(drone) === null);
   }

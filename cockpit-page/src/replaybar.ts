@@ -6,11 +6,12 @@ import { h, setAttribute, setDisabled, setHidden, setText, svg, unique } from ".
 import { t } from "./language/index.js";
 import { clamped, fine, type Mark, nearest, next, type Playback, type Replayed, SPEEDS, step, type Tick, ticksOf, type Timeline } from "./replaytime.js";
 
+// A mark or event this close is meant by a pointer.
 const NEAR_PX = 7;
 const NEAR_TOUCH_PX = 16;
-const APART_S = 0.3;
+const APART_S = 0.3; // nearer marks and events count as the present position
 const KEPT_MS = 900; // how long a requested position is shown before the replay confirms it
-const NOTES_MS = 5000;
+const NOTES_MS = 5000; // interval between reads of marks that other pages made
 const KEYS = "ArrowLeft ArrowRight ArrowUp ArrowDown Home End PageUp PageDown Space Comma Period";
 
 /** Drawn, because not every system's fonts have these symbols. */
@@ -76,7 +77,7 @@ export class ReplayBar {
     void this.load();
   }
 
-  /** `over`: it has reached its end. */
+  /** `over`: whether the replay has reached its end. */
   update(playback: Playback | null, over: boolean, now_ms: number): void {
     this.playback = playback ?? this.playback;
     this.over = over;
@@ -217,13 +218,13 @@ export class ReplayBar {
     this.paint(performance.now());
   }
 
-  /** One request at a time; of those meanwhile, only the last is sent. */
-  /** The replay is gone: nothing can be moved any more; or it is back. */
+  /** The replay is gone, so its position can't be changed any more; or it is back. */
   end(gone: boolean): void {
     this.gone = gone;
     this.element.inert = gone;
   }
 
+  /** Send one request at a time; changes wanted meanwhile are merged into the next one. */
   private send(wanted: object): void {
     if (this.gone) return;
     this.wanted = { ...this.wanted, ...wanted };
@@ -281,7 +282,7 @@ export class ReplayBar {
     if (this.replayed) this.know({ ...this.replayed, notes });
   }
 
-  /** Add this page's mark at the replay's position. */
+  /** The mark at the position shown; null if there is none. */
   private here(): Mark | null {
     return this.replayed?.notes.marks.find((mark) => Math.abs(mark.at_s - this.shown_s) < APART_S / 2) ?? null;
   }

@@ -68,7 +68,7 @@ export function nearest(ticks: readonly Tick[], at_s: number, within_s: number):
   return near.reduce<Tick | null>((best, tick) => (best === null || weight(tick) < weight(best) ? tick : best), null);
 }
 
-/** The next mark or event on one side; null: none. `apart_s`: nearer ones count as the present position. */
+/** The next mark or event on one side; null if there is none. `apart_s`: nearer ones count as the present position. */
 export function next(ticks: readonly Tick[], at_s: number, side: 1 | -1, apart_s: number): Tick | null {
   const beyond = ticks.filter((tick) => (tick.at_s - at_s) * side > apart_s);
   return (side > 0 ? beyond[0] : beyond.at(-1)) ?? null;

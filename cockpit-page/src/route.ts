@@ -29,7 +29,7 @@ export interface Route {
 }
 
 export interface Finding {
-  /** From 1; null: the whole route. */
+  /** Counted from 1; null for the whole route. */
   waypoint: number | null;
   severity: "error" | "warning";
   reason: string;
@@ -123,7 +123,7 @@ export function moved<T>(all: readonly T[], from: number, to: number): T[] {
   return [...rest.slice(0, to), all[from] as T, ...rest.slice(to)];
 }
 
-/** Problems of a waypoint or of the leg to it; the worst first. */
+/** The colour of a waypoint, by the worst problem of it or of the leg to it. */
 export function toneOf(check: RouteCheck | null, number: number): "accent" | "warn" | "bad" {
   const own = (check?.findings ?? []).filter((one) => one.waypoint === number);
   return own.some((one) => one.severity === "error") ? "bad" : own.length > 0 ? "warn" : "accent";

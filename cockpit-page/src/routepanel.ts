@@ -19,8 +19,8 @@ export interface RouteHost {
   act(deed: RouteDeed): void;
 }
 
-const CHECK_MS = 400;
-const HEIGHT_M = 1;
+const CHECK_MS = 400; // a route is checked once it has not changed for this long
+const HEIGHT_M = 1; // minimum height of the first waypoint chosen on the map
 const HEADS = ["x m", "y m", "z m", "m/s", t.route.yawHead, t.route.turnHead, t.route.wait, t.route.photo] as const;
 
 export class RoutePanel implements MapTool {
@@ -62,14 +62,14 @@ export class RoutePanel implements MapTool {
     this.edit(emptyRoute());
   }
 
-  /** The reason why nothing can be flown now; empty: it can. */
+  /** Set the reason why nothing can be flown now; empty if it can. */
   allow(why: string): void {
     if (why === this.can) return;
     this.can = why;
     this.show();
   }
 
-  /** The outcome of the flight. */
+  /** Show the progress of the flight. */
   update(progress: RouteProgress): void {
     this.flying = progress;
     const words = progress.kind.replace("route.", "").replaceAll("_", " ");
@@ -172,7 +172,7 @@ export class RoutePanel implements MapTool {
     this.edit({ ...this.route, waypoints: this.route.waypoints.filter((_, number) => number !== index) });
   }
 
-  /** Apply changes from the map and the table's fields; the table keeps its fields, and the focus. */
+  /** Apply a change made on the map; the table keeps its fields, and the focus. */
   private change(index: number, changes: Partial<RouteWaypoint>): void {
     const one = { ...(this.route.waypoints[index] as RouteWaypoint), ...changes };
     this.put(index, one);

@@ -11,7 +11,7 @@ export interface Described {
   state: string;
   /** The holder of control. */
   holder: string;
-  /** Its problems, the most severe first; empty: none. */
+  /** Its problems, the most severe first; empty if there are none. */
   alarm: string;
   alarmTone: Tone;
   /** Charge, 0 to 1; null while unknown. */

@@ -9,8 +9,8 @@ import type { DroneRow } from "./model.js";
 import { STEER_MS } from "./pilot.js";
 import type { Handlers } from "./socket.js";
 
-const WATCH_MS = 300;
-const SHOWN_MS = 15_000;
+const WATCH_MS = 300; // interval between pings
+const SHOWN_MS = 15_000; // how long an outcome is shown
 
 /** The drone that a key or the gamepad would stop. */
 export interface Target {
@@ -53,8 +53,9 @@ export class Safety {
   private target: Target | null = null;
   private asked: { deed: Deed; drones: readonly string[]; each: Map<string, { state: string; why: string }>; since_ms: number } | null = null;
   private flying = 0;
-  /** What began last with the drone that was aimed at then; with keys or the gamepad. */
+  /** The last hold that concerned only the drone aimed at. */
   private aimed: Deadly | null = null;
+  /** The last hold by keys or the gamepad. */
   private keyed: Deadly | null = null;
 
   constructor(
@@ -78,14 +79,14 @@ export class Safety {
     setInterval(() => this.commands.tick(WATCH_MS), STEER_MS);
   }
 
-  /** The drone stopped by its own button, by keys and by the gamepad; null: no drone to fly is visible. */
+  /** Set the drone that its own button, keys and the gamepad stop; null if no drone to fly is visible. */
   aim(target: Target | null): void {
     if (target?.name !== this.target?.name && this.countdown.holds(this.aimed)) this.countdown.release(); // the hold was meant for another drone
     this.target = target;
     this.show();
   }
 
-  /** From the last overview: those that fly. */
+  /** Handle the newest overview. */
   know(rows: readonly DroneRow[]): void {
     this.flying = rows.filter((row) => row.can_fly && !isRecording(row)).length;
     setAttribute(this.element, "data-flying", String(this.flying));
@@ -164,7 +165,7 @@ export class Safety {
   }
 }
 
-/** On the control itself: pending, sent, refused, not sent. */
+/** Show the outcome of a command on its control: pending, sent, refused, not sent. */
 export function showFate(button: HTMLElement, place: HTMLElement, result: Result | null): void {
   setAttribute(button, "data-fate", result?.fate ?? "");
   setText(place, result ? t.commands.fates[result.fate] : "");

@@ -33,12 +33,12 @@ import type { Vector } from "./model.js";
 import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
-const PERIOD_MS = 50;
-const POINTS = 4096; // maximum of the path
+const PERIOD_MS = 50; // interval between drawings
+const POINTS = 4096; // maximum number of points of the path
 
 const TURNS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"]);
 const NEARER: Readonly<Record<string, number>> = { Equal: 0.85, NumpadAdd: 0.85, Minus: 1.18, NumpadSubtract: 1.18 };
-const TURN_RAD = 0.1;
+const TURN_RAD = 0.1; // per press of a key
 
 export class SceneView {
   readonly element = h("div", { class: "scene", role: "application", tabindex: 0, "data-keys": [...TURNS, ...Object.keys(NEARER)].join(" "), "aria-label": t.map.space });

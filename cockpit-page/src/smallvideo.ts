@@ -69,7 +69,7 @@ export class SmallVideo {
     });
   }
 
-  /** Whether any are shown now. */
+  /** Start or stop requesting pictures. */
   run(wanted: boolean): void {
     if (wanted === this.wanted) return;
     this.wanted = wanted;

@@ -2,7 +2,7 @@
 
 export const FIRST_PAUSE_MS = 200;
 export const LONGEST_PAUSE_MS = 1000;
-/** After a refusal: nothing will change soon. */
+/** Pause after a refusal, because nothing will change soon. */
 export const REFUSED_PAUSE_MS = 2000;
 
 export interface Handlers {
@@ -70,7 +70,7 @@ export class LastingSocket {
     this.wire.close();
   }
 
-  /** Begin anew, as the path says now. */
+  /** Reconnect, to what the path is now. */
   reopen(): void {
     this.wire.close();
   }

@@ -6,6 +6,7 @@ import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
 
 export const CENTRED: Readonly<Sticks> = { forward: 0, left: 0, up: 0, yaw_rate: 0 };
+/** Share of the full deflection that counts as centred. */
 export const DEAD_BAND = 0.12;
 /** Time for keys to go from nothing to full [s]: a tap is a nudge. */
 export const RAMP_S = 0.3;
@@ -52,9 +53,11 @@ export function ramp(now: Sticks, wanted: Sticks, seconds: number): Sticks {
 
 export interface Pace {
   name: string;
-  /** [m/s], horizontal and vertical; [rad/s]. */
+  /** Horizontal [m/s]. */
   speed: number;
+  /** Vertical [m/s]. */
   climb: number;
+  /** Yaw rate [rad/s]. */
   turn: number;
 }
 

@@ -11,7 +11,7 @@ import type { Pilot } from "./pilot.js";
 import { QuestionPanel } from "./question.js";
 import { showFate } from "./safety.js";
 
-const USUAL_PRIORITY = 8; // before the controllers' usual 16
+const USUAL_PRIORITY = 8; // higher than 16, which controllers usually have
 
 /** A button with its key beside it, and the outcome of its command on it. */
 function keyed(name: string, key: string, kind: string, act: () => void): HTMLButtonElement {

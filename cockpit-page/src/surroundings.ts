@@ -28,7 +28,7 @@ export interface CameraView {
 
 export interface World {
   name: string;
-  /** The source: the drone, or the cockpit's file; null: none. */
+  /** The source: the drone, or the cockpit's file; null if there is none. */
   source: "vehicle" | "file" | null;
   room: { low: Vector; high: Vector; enclosed: boolean } | null;
   solids: (Thing & { size: Vector })[];
@@ -42,8 +42,8 @@ export interface World {
   cameras: CameraView[];
 }
 
-const AGAIN_MS = 150;
-const RETRY_MS = 3000;
+const AGAIN_MS = 150; // pause before a read, to join several requests
+const RETRY_MS = 3000; // pause after a failed read
 
 export class Surroundings {
   /** null until it was read. */

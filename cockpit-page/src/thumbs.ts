@@ -13,7 +13,7 @@ interface Stick {
   call(label: string): void;
   /** From −1 to 1, right and up positive: the position of the finger that holds it, else the centre. */
   read(): readonly [number, number];
-  /** The finger must let go first. */
+  /** Centre the stick; it must be pressed again. */
   release(): void;
 }
 
@@ -90,7 +90,7 @@ export class Thumbs {
     return Object.assign({ ...CENTRED }, ...this.sides.map(({ place, stick }) => thumbed(settings.get("mode"), place, ...stick.read()))) as Sticks;
   }
 
-  /** Held sticks no longer count until they are released. */
+  /** Centre both sticks; they must be pressed again. */
   release(): void {
     for (const { stick } of this.sides) stick.release();
   }

@@ -8,8 +8,8 @@ import type { DroneRow } from "./model.js";
 import { describe, titleOf } from "./row.js";
 import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
 
-const STALE_S = 1;
-const RATE_S = 2;
+const STALE_S = 1; // an older picture is marked
+const RATE_S = 2; // interval between updates of the rate
 /** A picture slightly smaller than its place: hardly visible, and cheaper. */
 const SHARE = 0.9;
 /** When a tile's width changes by more than this share, it requests another size of picture. */
@@ -112,7 +112,7 @@ export class Tile implements Sink {
     this.bytes += bytes;
   }
 
-  /** How its pictures arrive, shown on hover: about once a second. */
+  /** Update how its pictures arrive, which is shown on hover. */
   private showRate(now_ms: number): void {
     const seconds = (now_ms - this.rated.at_ms) / 1000;
     if (seconds < RATE_S || this.head === null) return;

@@ -14,10 +14,10 @@ import { NewestFrame, type Received, unpack } from "./newest.js";
 import { LastingSocket } from "./socket.js";
 import { VideoTools } from "./videotools.js";
 
-const LATE_S = 0.25;
-const STALE_S = 1;
-const RATE_MS = 2000;
-const TELL_MS = 90;
+const LATE_S = 0.25; // an older picture's age is shown as a warning
+const STALE_S = 1; // an even older picture is marked as old
+const RATE_MS = 2000; // time over which rates are measured
+const TELL_MS = 90; // interval between updates of age and rate
 /** When a picture's width differs by more than this share from the requested one, another size is requested. */
 const OTHER = 0.15;
 const TOLD_LATE_MS = 3000; // how long the page reports a drawing that came too late
@@ -255,7 +255,7 @@ export class VideoView {
     } else if (this.why === "failed") this.socket.send({ h264: false });
   }
 
-  /** Width of its place [device pixels]; 0: unknown, or wanted in full. */
+  /** Width of its place [device pixels]; 0 if unknown, or if the full size is wanted. */
   private width_px(): number {
     return this.tools.wanted ? 0 : Math.round(this.canvas.clientWidth * (window.devicePixelRatio || 1));
   }
@@ -329,7 +329,7 @@ export class Stage {
     return tool !== undefined;
   }
 
-  /** The reason why no target can be followed now; empty: it can. */
+  /** Set the reason why no target can be followed now; empty if it can. */
   allowFollow(why: string): void {
     this.canFollow = why;
     for (const view of this.views.values()) view.follow?.allow(why);

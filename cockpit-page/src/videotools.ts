@@ -8,9 +8,9 @@ import { settings } from "./settings.js";
 
 /** A clip is kept in the browser's memory until saved: it stops after this time [s]. */
 const LONGEST_S = 300;
-const ROUND_MS = 250;
-const SAID_MS = 5000;
-const STALE_S = 1;
+const ROUND_MS = 250; // interval between updates
+const SAID_MS = 5000; // how long a message is shown
+const STALE_S = 1; // an older picture is marked
 const FORMATS = ["video/webm;codecs=vp9", "video/webm;codecs=vp8", "video/webm", "video/mp4"] as const;
 const ICONS = {
   photo: "M3 6h3l1.5-2h5L14 6h3v10H3zM10 8.2a2.9 2.9 0 1 0 .01 0z",
@@ -77,7 +77,7 @@ export class VideoTools {
     this.screen.addEventListener("leavepictureinpicture", () => this.endApart());
   }
 
-  /** Pictures are wanted although the page may be hidden. */
+  /** Whether pictures are wanted even if the page is hidden. */
   get wanted(): boolean {
     return this.clip !== null || this.apart;
   }

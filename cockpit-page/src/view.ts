@@ -35,7 +35,7 @@ export function around(places: readonly (readonly [number, number, ...number[]])
   return { east: (west + east) / 2, north: (south + north) / 2, scale: Math.min(size.width / wide, size.height / high) };
 }
 
-/** The distance of two views, as a share of the smaller one's extent. */
+/** The difference between two views: the shift as a share of the smaller extent, or the logarithm of the zoom, if larger. */
 export function apart(one: View, other: View, size: Size): number {
   const way_m = Math.hypot(one.east - other.east, one.north - other.north);
   const scale = Math.max(one.scale, other.scale);

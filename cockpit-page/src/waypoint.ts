@@ -28,13 +28,13 @@ export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
   return { distance_m: Math.hypot(along, up), time_s: speeds && Math.max(along / speeds.along, up / speeds.up) };
 }
 
-const AGAIN_MS = 1000;
+const AGAIN_MS = 1000; // interval between questions whether the drone may fly there
 const ABOVE_GROUND_M = 1; // height of a place chosen before take-off
 
 export interface WaypointHost {
   /** The drone's position; null while unknown. */
   own(): Vector | null;
-  /** It stands on the ground: a place at its height can't be flown to. */
+  /** Whether the drone is on the ground: a place at its height can't be flown to. */
   stands(): boolean;
   speeds(): Speeds | null;
   /** The reason why it may not fly to a place; empty if it may. */
@@ -133,7 +133,7 @@ export class WaypointTool implements MapTool {
     this.show();
   }
 
-  /** A field was edited; an empty one keeps its value. */
+  /** A field was edited; an empty one stands for the drone's own coordinate. */
   private typed(): void {
     const own = this.host.own();
     const some = this.inputs.some((input) => input.value !== "");

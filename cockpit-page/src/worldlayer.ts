@@ -140,7 +140,7 @@ function drawGate(chart: Chart, { position, size, yaw, frame }: World["gates"][n
   pen.stroke();
 }
 
-/** A ring at its start. */
+/** Two rings at a drone's start. */
 export function home({ pen, ink, at }: Chart, place: readonly number[], tone: string): void {
   const [x, y] = at(place);
   pen.strokeStyle = ink[tone] ?? "";

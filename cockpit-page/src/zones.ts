@@ -8,6 +8,7 @@ export const ZONES = "safety.zones";
 export const MAX_ZONES = 32;
 /** A wall of the safety box this far away counts as absent [m]: docs/proxy.md. */
 export const FAR_M = 10_000;
+/** The smallest extent of a zone. */
 const LEAST_M = 0.05;
 
 /** What is edited: the safety box, or the zone with a number. */
@@ -110,7 +111,7 @@ export function round(centre: readonly [number, number], edge: readonly [number,
   return { kind: "cylinder", centre: [cm(centre[0]), cm(centre[1])], radius: Math.max(LEAST_M, cm(Math.hypot(edge[0] - centre[0], edge[1] - centre[1]))), low, high };
 }
 
-/** The zone that contains a place of the map, the smallest first; null: none. */
+/** The smallest zone that contains a place of the map; null if there is none. */
 export function zoneAt(zones: readonly Zone[], [x, y]: readonly [number, number]): number | null {
   const sizes = zones.map((zone) => {
     if (zone.kind === "cylinder") return Math.hypot(x - zone.centre[0], y - zone.centre[1]) <= zone.radius ? zone.radius * zone.radius * Math.PI : Number.POSITIVE_INFINITY;

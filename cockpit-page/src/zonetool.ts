@@ -9,13 +9,13 @@ import type { Zone } from "./surroundings.js";
 import { zoneOutline } from "./worldlayer.js";
 import { type Bounds, type Edited, fields, freeName, handles, MAX_ZONES, rectangle, round, writes, zoneAt, zoneName } from "./zones.js";
 
-const DEFAULT_TOP_M = 3;
+const DEFAULT_TOP_M = 3; // height of new zones while the drone's ceiling is unknown
 
 export interface ZoneHost {
   bounds(): Bounds;
   /** The ceiling of the drone [m], as the height of new zones; null if unknown. */
   ceiling(): number | null;
-  /** Returns the reason of a refusal; empty if it was written. */
+  /** Returns the reason for a refusal; empty if it was written. */
   write(name: string, value: string | number): Promise<string>;
   /** The written or refused values are to be read again. */
   reload(): void;
@@ -126,11 +126,11 @@ export class ZoneTool implements MapTool {
     return true;
   }
 
-  /** The dragged state is dropped. */
   cursor(spot: Spot): void {
     this.move(spot);
   }
 
+  /** Forget what is being drawn or dragged. */
   dropped(): void {
     this.adding = this.grabbed = this.draft = null;
     this.show();

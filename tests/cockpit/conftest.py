@@ -27,7 +27,7 @@ def node() -> Iterator[Node]:
 @pytest.fixture
 def client(node: Node) -> Iterator[TestClient]:
     """The cockpit of that proxy."""
-    with cockpit(Fleet(Nodes(node), look_s=0.05)) as client:
+    with cockpit(Fleet(Nodes(node), search_s=0.05)) as client:
         yield client
 
 

@@ -24,7 +24,7 @@ FAR = {"name": "far", "speed": 1.0, "waypoints": [{"x": 30.0, "y": 0.0, "z": 1.0
 
 @pytest.fixture
 def client(node: Node) -> Iterator[TestClient]:
-    with cockpit(Fleet(Nodes(node), look_s=0.05), follower=StandIns()) as client:
+    with cockpit(Fleet(Nodes(node), search_s=0.05), follower=StandIns()) as client:
         client.headers.update(ORIGIN)
         yield client
 

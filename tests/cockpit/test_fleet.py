@@ -181,7 +181,7 @@ def test_a_failing_finder_is_retried() -> None:
             return hangar()
 
     async def work() -> None:
-        fleet = Fleet(Failing(), hangar.connect, look_s=0.005)
+        fleet = Fleet(Failing(), hangar.connect, search_s=0.005)
         await fleet.start()
         while asked < 5:
             await asyncio.sleep(0.005)
@@ -211,7 +211,7 @@ def rows(client: TestClient) -> list[dict[str, Any]]:
 def test_drones_come_and_go_in_the_overview(nodes: Nodes) -> None:
     gamma = Node("gamma")
     try:
-        with cockpit(Fleet(nodes, look_s=0.02)) as client:
+        with cockpit(Fleet(nodes, search_s=0.02)) as client:
             assert [row["name"] for row in rows(client)] == ["alpha", "beta"]
             assert all(row["transport"] == "memory" and row["can_fly"] for row in rows(client))
             nodes.nodes.append(gamma)
@@ -235,7 +235,7 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
             return [Found("alpha", where, node.dial) for where, node in here.items() if node.up]
 
     try:
-        with cockpit(Fleet(Moving(), look_s=0.02)) as client, open_socket(client, "drones/alpha/telemetry") as page:
+        with cockpit(Fleet(Moving(), search_s=0.02)) as client, open_socket(client, "drones/alpha/telemetry") as page:
             until(lambda: rows(client)[0]["links"]["application"] == "up")
             before.stop()
             here.clear()
@@ -251,7 +251,7 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
 
 
 def test_the_overview_shows_the_holder_of_control(nodes: Nodes) -> None:
-    with cockpit(Fleet(nodes, look_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
+    with cockpit(Fleet(nodes, search_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
         control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})
         until(lambda: rows(client)[0]["me"])
         first, second = rows(client)

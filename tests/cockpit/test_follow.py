@@ -55,7 +55,7 @@ def stand_ins() -> StandIns:
 
 @pytest.fixture
 def client(node: Node, stand_ins: StandIns) -> Iterator[TestClient]:
-    with cockpit(Fleet(Nodes(node), look_s=0.05), follower=stand_ins) as client:
+    with cockpit(Fleet(Nodes(node), search_s=0.05), follower=stand_ins) as client:
         yield client
 
 

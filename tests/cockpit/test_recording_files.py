@@ -44,7 +44,7 @@ def nodes() -> Iterator[Nodes]:
 
 def serve(nodes: Nodes, folder: Path, **options: Any) -> Any:
     gate = options.pop("gate", this_user())
-    return cockpit(Fleet(nodes, look_s=0.02), recordings=Recordings(folder, **options), gate=gate)
+    return cockpit(Fleet(nodes, search_s=0.02), recordings=Recordings(folder, **options), gate=gate)
 
 
 def post(client: TestClient, path: str, body: Any = None) -> Any:

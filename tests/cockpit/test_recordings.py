@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def serve(nodes: Nodes, folder: Path, **options: Any) -> Any:
-    return cockpit(Fleet(nodes, look_s=0.02), recordings=Recordings(folder, **options))
+    return cockpit(Fleet(nodes, search_s=0.02), recordings=Recordings(folder, **options))
 
 
 def post(client: TestClient, path: str, body: Any = None) -> Any:

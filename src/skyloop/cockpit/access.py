@@ -37,9 +37,9 @@ from skyloop.platform import is_open_to_others, is_own_user
 
 SESSION_S: Final = 12 * 3600.0  #: period for which a session is valid
 PAIRING_S: Final = 3600.0  #: period for which a pairing code is valid
-MAX_SESSIONS: Final = 1000
+MAX_SESSIONS: Final = 1000  #: a further log-in ends the oldest session
 SHORTEST_TOKEN: Final = 16  #: minimum length in characters; a shorter token could be guessed
-MAX_TOKEN: Final = 256
+MAX_TOKEN: Final = 256  #: maximum length in characters
 CERTIFICATE: Final = "peer_certificate"  #: key under which a connection's state holds the client's certificate
 
 FIRST_S: Final = 0.25  #: delay after the first wrong token from an address; doubled by each further one
@@ -48,7 +48,7 @@ FORGET_S: Final = 600.0  #: an address starts over if it has sent no wrong token
 MAX_ADDRESSES: Final = 1024  #: maximum number of addresses remembered; the quietest one is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens allowed per minute, over all addresses, before the delay below is added
 EACH_IN_ALL_S: Final = 0.1  #: additional delay for each wrong token beyond those, from any address
-MOST_IN_ALL_S: Final = 4.0
+MOST_IN_ALL_S: Final = 4.0  #: maximum of this additional delay
 _MINUTE_NS: Final = nanoseconds(60.0)
 
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
@@ -63,12 +63,11 @@ _log = logging.getLogger(__name__)
 
 
 def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
-    """Return the user id of the program at the client end of a loopback connection.
+    """Return the user id of the program at the client end of a loopback connection, or None if it is unknown.
 
-    Look up the connection in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in
-    proc_pid_net(5) and the kernel's ``proc_net_tcp.txt``, whose columns are local and remote address in hexadecimal,
-    state, …, user id and inode. A socket that its program has already closed is listed with user 0 and inode 0, so an
-    entry without an inode does not reveal who opened the socket. Return the user id, or None if it is unknown.
+    The kernel's tables of sockets (``/proc/net/tcp`` and ``tcp6``, Linux only) are described in proc_pid_net(5) and in
+    the kernel's ``proc_net_tcp.txt``. A socket that its program has already closed is listed with user 0 and inode 0,
+    so an entry without an inode does not reveal who opened the socket.
     """
     for table in _TABLES:
         with suppress(OSError):
@@ -89,10 +88,7 @@ def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
 
 
 def _table_entry(end: Endpoint, mapped: bool) -> str:
-    """Format an address as the table does: 32-bit words in the host's byte order.
-
-    ``mapped``: whether to write an IPv4 address as an IPv4-mapped IPv6 address.
-    """
+    """Format an address as the table does, in 32-bit words of host order. ``mapped``: write IPv4 as IPv6."""
     address = ipaddress.ip_address(end[0])
     packed = address.packed
     if mapped and address.version == 4:
@@ -130,7 +126,7 @@ class Gate(Protocol):
 
 
 class OpenGate:
-    """Gives the same role to every program of the same user on this machine.
+    """Gives one role to every program of this user, or of the superuser, on this machine.
 
     ``uid_of``: returns the client's user id, given the addresses of both ends.
     """
@@ -254,10 +250,7 @@ class TokenGate:
         return found
 
     def begin(self, person: Person, token: str = "") -> str:
-        """Begin a session and return its cookie. If there are too many sessions, drop the oldest.
-
-        ``token``: the token for which the session was created.
-        """
+        """Begin a session and return its cookie; drop the oldest if there are too many. ``token``: its origin."""
         now_ns = self._clock()
         self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
         while len(self._sessions) >= MAX_SESSIONS:
@@ -297,11 +290,7 @@ class CertificateGate:
 
 
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
-    """Return the role and name in a certificate.
-
-    ``certificate``: the certificate in the form returned by ``SSLObject.getpeercert()``. Return None unless
-    exactly one OU is a role.
-    """
+    """Return the role and name in an ``SSLObject.getpeercert()`` certificate; None unless exactly one OU is a role."""
     if not certificate:
         return None
     fields = [pair for part in certificate.get("subject", ()) for pair in part]
@@ -367,7 +356,6 @@ def _header(scope: Scope, wanted: bytes) -> str | None:
 
 
 def has_token(scope: Scope) -> bool:
-    """Return whether this request carries a token."""
     return any(name.lower() == b"authorization" for name, _ in scope["headers"])
 
 
@@ -415,7 +403,7 @@ class WrongTokens:
 # Sessions that outlive the cockpit's process ---------------------------------------------------------------------
 
 
-MAX_BYTES: Final = 1_000_000
+MAX_BYTES: Final = 1_000_000  #: the file's maximum size; a longer one counts as damaged
 
 
 class Session(msgspec.Struct, frozen=True):

@@ -15,14 +15,14 @@ from urllib.parse import urlsplit
 from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.errors import UsageError
 
-DEFAULT_PORT: Final = 8420
+DEFAULT_PORT: Final = 8420  #: TCP port of the page
 NEXT_PORTS: Final = 9  #: number of further ports to try if the default port is in use
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _LISTENS: Final = "0A"  # state of a listening socket in the kernel's socket tables
 _LOCAL, _STATE, _INODE = 1, 3, 9  # column indexes in these tables
 _SIOCGIFADDR: Final = 0x8915  # Linux ioctl that returns an interface's IPv4 address
 _MDNS: Final = Path("/run/avahi-daemon/socket")
-_MAX_COMMAND: Final = 60
+_MAX_COMMAND: Final = 60  # number of characters shown of a command line
 
 
 def bind(address: str, port: int | None) -> socket.socket:
@@ -96,13 +96,13 @@ def reachable(address: str) -> list[str]:
     known = ipaddress.ip_address(address)
     if not known.is_unspecified:
         return [address]
-    families = [(socket.AF_INET, "192.0.2.1")]
+    families = [(socket.AF_INET, "192.0.2.1")]  # an address reserved for documentation (RFC 5737; below: RFC 3849)
     if known.version == 6:
         families.append((socket.AF_INET6, "2001:db8::1"))
     found = []
     for family, somewhere in families:
         with suppress(OSError), closing(socket.socket(family, socket.SOCK_DGRAM)) as probe:
-            probe.connect((somewhere, 9))  # this sends nothing; it only selects our address for that route
+            probe.connect((somewhere, 9))  # sends nothing; only selects our address on the route to other networks
             found.append(str(probe.getsockname()[0]))
     return found or own_addresses() or ["127.0.0.1" if known.version == 4 else "::1"]
 
@@ -126,7 +126,7 @@ def own_addresses() -> list[str]:
 
 
 def host_names() -> tuple[str, ...]:
-    """Return this machine's host name, and its multicast DNS name if a program answers for that name."""
+    """Return this machine's host name, and its multicast DNS name (``NAME.local``) if Avahi is running."""
     name = socket.gethostname()
     return (name, f"{name.partition('.')[0]}.local") if _MDNS.exists() else (name,)
 

@@ -26,24 +26,16 @@ _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
 
 
 class AlarmSeverity(StrEnum):
-    """How urgent an alarm is."""
-
     WARNING = "warning"
     CRITICAL = "critical"
 
 
 class Alarm(msgspec.Struct, frozen=True):
-    """A problem that currently exists.
+    """A problem that currently exists."""
 
-    Args:
-        id: The subject of the alarm. It is constant while the alarm lasts, so a page can remember the acknowledgement.
-        severity: Its level may rise while the alarm lasts, for example when a degraded link is lost.
-        text: A description that includes the current value.
-    """
-
-    id: str
-    severity: AlarmSeverity
-    text: str
+    id: str  #: the alarm's subject; constant while the alarm lasts, so that a page can remember its acknowledgement
+    severity: AlarmSeverity  #: may rise while the alarm lasts, for example when the battery becomes critical
+    text: str  #: a description that includes the current value
 
 
 class Thresholds(msgspec.Struct, frozen=True):
@@ -159,10 +151,7 @@ PARAMETERS: Final = {
 
 
 class ThresholdReader:
-    """Reads the thresholds, and reads them again after a parameter has been written or a link restored.
-
-    Created and used on the event loop.
-    """
+    """Reads the thresholds, and rereads them when they may have changed. Created and used on the event loop."""
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
         self._drone = drone
@@ -175,7 +164,7 @@ class ThresholdReader:
         self._listener = drone.on_event(lambda event: call_soon(loop, self.on_event, event))
 
     def on_event(self, event: Event) -> None:
-        """Record that the thresholds may have changed."""
+        """Reread the thresholds after a parameter was written, the proxy came back, or the vehicle link changed."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._is_stale, self._tried_ns = True, None
@@ -190,14 +179,13 @@ class ThresholdReader:
         return self._values
 
     def close(self) -> None:
-        """Unregister from the drone."""
         self._listener.cancel()
 
     async def _read(self) -> None:
         try:
             self._values = await asyncio.to_thread(thresholds_of, self._drone.config)
         except SkyloopError:
-            self._is_stale = True  # there was no answer: try again after RETRY_S
+            self._is_stale = True  # try again after RETRY_S
         finally:
             self._task = None
 

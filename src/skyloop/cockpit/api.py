@@ -13,7 +13,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from skyloop.cockpit.access import SESSION_S, Gate, TokenGate
+from skyloop.cockpit.access import MAX_TOKEN, SESSION_S, Gate, TokenGate
 from skyloop.cockpit.security import gone_within, person_of
 from skyloop.cockpit.telemetry import encode_json, number
 from skyloop.control.route import check_for, parse_route
@@ -109,10 +109,7 @@ def check_json(request: Request) -> None:
 
 
 async def body_of(request: Request, kind: type[T]) -> T:
-    """Read and decode a request's body.
-
-    Raise ``BadRequest`` if the body is not JSON, is too large, does not arrive in time, or has the wrong type.
-    """
+    """Read and decode a body; raise ``BadRequest`` if it is not JSON, too large, too late, or of the wrong type."""
     check_json(request)
     data = b""
     try:
@@ -130,7 +127,7 @@ async def body_of(request: Request, kind: type[T]) -> T:
 
 
 class _Login(msgspec.Struct):
-    token: Annotated[str, msgspec.Meta(max_length=256)]
+    token: Annotated[str, msgspec.Meta(max_length=MAX_TOKEN)]
 
 
 class Api:
@@ -170,7 +167,7 @@ class Api:
     # Sessions --------------------------------------------------------------------------------------------------
 
     async def session(self, request: Request) -> Response:
-        """Respond with the client's role, or with null for strangers, and a hint on how to log in."""
+        """Respond with the client's role and name or, for strangers, with a null role and a hint on how to log in."""
         person = person_of(request.scope)
         return answer_json(
             {
@@ -210,7 +207,6 @@ class Api:
 
     @answered
     async def logout(self, request: Request) -> Response:
-        """End the session of the request's cookie."""
         answer = answer_json({"role": None})
         if isinstance(self._gate, TokenGate):
             self._gate.end(request.scope)
@@ -229,7 +225,6 @@ class Api:
     # Drones ----------------------------------------------------------------------------------------------------
 
     async def drones(self, _: Request) -> Response:
-        """Respond with the connected drones."""
         return answer_json(
             [
                 {"name": name, "uri": one.drone.uri, "cameras": [c.name for c in one.drone.capabilities.cameras]}
@@ -239,17 +234,13 @@ class Api:
 
     @answered
     async def parameters(self, request: Request) -> Response:
-        """Respond with a drone's parameters."""
         station = self._fleet.station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
         return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
-        """Respond with counts of the messages sent to pages.
-
-        See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` covers only the current cameras.
-        """
+        """Respond with the server's :class:`.PageCounts`; ``frames_encoded`` covers only the current cameras."""
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return answer_json(
             {
@@ -271,7 +262,7 @@ class Api:
 
 
 def parameter_values(parameter: Parameter) -> dict[str, Any]:
-    """Return a parameter as JSON values, including all information needed to edit it."""
+    """Return a parameter as JSON values, with everything needed to edit it."""
     return {
         "name": parameter.name,
         "type": str(parameter.type),
@@ -320,18 +311,15 @@ class RoutesApi:
 
     @answered
     async def listing(self, _: Request) -> Response:
-        """Respond with the stored routes."""
         return answer_json(await asyncio.to_thread(self._files.listing))
 
     @answered
     async def load(self, request: Request) -> Response:
-        """Respond with a route's file."""
         route = await asyncio.to_thread(self._files.load, request.path_params["name"])
-        return Response(route.to_json(), media_type="application/json")
+        return Response(route.to_json(), media_type=_JSON)
 
     @answered
     async def save(self, request: Request) -> Response:
-        """Store a route under the given name."""
         name, route = request.path_params["name"], parse_route(bytes(await body_of(request, msgspec.Raw)))
         await asyncio.to_thread(self._files.save, name, route)
         return answer_json({"name": name}, 201)

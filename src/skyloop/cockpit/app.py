@@ -5,7 +5,7 @@
 ``/api/…``                              see :mod:`skyloop.cockpit.api` and :mod:`skyloop.cockpit.recordings_api`
 ``/ws/overview``                        to the page: all drones, twice a second
 ``/ws/control``                         from the page: commands to all drones; to the page: their outcome
-``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
+``/ws/video``                           to the page: small frames of the cameras it asks for; back: ``show``, ``ack``, …
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, in JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
 ``/ws/drones/NAME/control``             from the page: commands; to the page: their outcome, the pilot
@@ -57,10 +57,10 @@ from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
 SMALLEST_PACKED: Final = 1000  #: minimum size of a response worth compressing [bytes]
-_PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")
-_NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")
+_PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")  # media types to compress
+_NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")  # esbuild's names of chunks (chunkNames in build.mjs)
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
-_FOR_GOOD: Final = "private, max-age=31536000, immutable"
+_FOR_GOOD: Final = "private, max-age=31536000, immutable"  # for a year: the address changes with the content
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class _File:
 
 
 class PageFiles(StaticFiles):
-    """Serves the folder that contains the page. ``folder``: the folder, which need not exist."""
+    """Serves the folder that contains the page; the folder need not exist."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder, check_dir=False)
@@ -96,7 +96,7 @@ class PageFiles(StaticFiles):
         return self._answer(file, Headers(scope=scope), _FOR_GOOD if for_good else "no-cache")
 
     async def page(self) -> Response:
-        """Return the page, in which file names carry a hash of their content."""
+        """Return the page, in which references to files carry a hash of their content."""
         try:
             text = self._index.read_text()
         except OSError:
@@ -157,7 +157,6 @@ class Cockpit:
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        """Run the fleet while the server runs."""
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS, "cockpit"))
         await self._fleet.start()
         try:
@@ -168,16 +167,13 @@ class Cockpit:
             await self._fleet.close()
 
     async def page(self, _: Request) -> Response:
-        """Respond with the page."""
         return await self.files.page()
 
     async def overview(self, socket: WebSocket) -> None:
-        """Send the overview of all drones to a page."""
         await socket.accept()
         await BroadcastSender(socket, self._overview.broadcast).run()
 
     async def small_video(self, socket: WebSocket) -> None:
-        """Send small video streams of many drones to a page."""
         await socket.accept()
         await SmallVideoSender(socket, self._fleet.stations, self.counts).run()
 
@@ -191,7 +187,6 @@ class Cockpit:
         await FleetSession(socket, self._fleet, person.name).run()
 
     async def telemetry(self, socket: WebSocket) -> None:
-        """Send one drone's telemetry to a page."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -202,7 +197,6 @@ class Cockpit:
             self.counts.pages -= 1
 
     async def video(self, socket: WebSocket) -> None:
-        """Send one camera's video to a page."""
         station = await self._accept(socket)
         if station is None:
             return

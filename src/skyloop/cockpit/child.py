@@ -15,7 +15,7 @@ from skyloop.child_process import ChildProcess
 from skyloop.errors import LinkError
 from skyloop.platform import read_within
 
-_ASK_S = 2.0
+_ASK_S = 2.0  # time limit for the cockpit's response
 
 
 class CockpitProcess:
@@ -28,7 +28,7 @@ class CockpitProcess:
         """Start the child without waiting for the page; see :meth:`address`.
 
         ``name``: the proxy to show; by default, all proxies are shown. ``port``: the loopback port; 0 selects a free
-        port, and None the default port or the next free one.
+        port, and None the default port or the next free one. ``recordings``: the folder for recordings.
         """
         names = [] if name is None else [name]
         options = [] if recordings is None else ["--recordings", str(recordings)]

@@ -18,8 +18,8 @@ Word = Annotated[str, msgspec.Meta(max_length=64)]
 LATE_S: Final = 0.5  #: a command that may be older is refused; its sender no longer expects it to be obeyed
 #: Maximum age of an emergency stop; the page shows the stop as pending for this long.
 STOP_LATE_S: Final = 2.0
-#: If deflected sticks have not moved for this long, the page assumes that nobody is holding them. Bluetooth can take up
-#: to 20 s to report a lost gamepad.
+#: If deflected sticks have not moved for this long, the cockpit assumes that nobody is holding them. Bluetooth can take
+#: up to 20 s to report a lost gamepad.
 UNTOUCHED_S: Final = 10.0
 AHEAD_S: Final = 0.05  #: clock difference tolerated beyond the page's own bound; the same as for commands from programs
 SETTLED_NS: Final = 50_000_000  #: feedback captured this soon after a command may predate the command [ns]
@@ -62,7 +62,7 @@ class TakeOff(Command, frozen=True, tag="takeoff"): ...
 
 
 class HoverHere(Command, frozen=True, tag="hover"):
-    """Hover because a person requested it or, if ``automatic``, because no input is held, without taking control."""
+    """Hover because a person requested it or, if ``automatic``, because no key or stick is held anymore."""
 
     automatic: bool = False
 
@@ -154,8 +154,6 @@ class StopFollowing(Command, frozen=True, tag="follow_stop"):
 
 
 class Write(Command, frozen=True, tag="set"):
-    """Write a parameter."""
-
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
     value: bool | int | float | str | list[float]
 
@@ -223,19 +221,18 @@ def late_s(command: Command) -> float:
 
 
 class HandWatch:
-    """Determines whether a person's hand is holding the deflected sticks. Pure.
+    """Determines whether a person's hand is holding the deflected sticks.
 
     Hands are never still: fingers move by pixels, held keys repeat, and axes at their limits jitter. The values from a
     gamepad that has lost its radio link stay constant; so do those from a page that has lost track of held keys.
     """
 
     def __init__(self) -> None:
-        """Initialise with untouched sticks."""
         self._last: Fly | None = None
         self._moved_s = 0.0
 
     def holds(self, sticks: Fly, now_s: float) -> bool:
-        """Handle a stick command; return whether there was a sign of a hand within :data:`UNTOUCHED_S`."""
+        """Handle a stick command; return whether the sticks were touched within :data:`UNTOUCHED_S`."""
         last, self._last = self._last, sticks
         same = last is not None and all(
             getattr(last, name) == getattr(sticks, name) for name in ("forward", "left", "up", "yaw_rate", "touches")

@@ -3,10 +3,10 @@
 A command that arrives in time (:func:`skyloop.cockpit.commands.untimely`) is carried out; any other is refused and
 never carried out later. The only exception is the hover sent when sticks are released, which may be of any age.
 
-The page has a dead-man switch: if the page flies with sticks or to a waypoint and sends nothing for :data:`SILENT_S`,
-the vehicle hovers. A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated
-as a silent pilot: the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts as
-it would for any program. When the page's connection ends, the vehicle hovers immediately and authority is released.
+There is a dead-man switch: if a page that is flying the vehicle sends nothing for :data:`SILENT_S`, the vehicle hovers.
+A page that has not confirmed for :data:`GONE_S` that it receives data from the cockpit is treated as a silent pilot:
+the cockpit stops repeating its commands, so the proxy ends its lease and the failsafe ladder acts as it would for any
+program. When the page's connection ends, a vehicle that it is flying hovers immediately, and authority is released.
 """
 
 from __future__ import annotations
@@ -39,14 +39,13 @@ if TYPE_CHECKING:
     from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 
-SILENT_S: Final = 0.5  #: a page that is flying but sends nothing for this long is considered dead
+SILENT_S: Final = 0.5  #: the vehicle hovers if the page that is flying it sends nothing for this long
 #: If a page receives nothing from the cockpit for this long, it can't fly, and its control expires.
 GONE_S: Final = 2.0
 _REFUSE_AGAIN_S: Final = 1.0  # interval between identical refusals of stick commands, which arrive 20 times a second
 _DOWN: Final = frozenset({FlightState.LANDED})
-# Time limits for repeating a take-off: without and with the proxy's acknowledgement.
-_TAKEOFF_NS: Final = 1_000_000_000
-_BEGUN_NS: Final = 6_000_000_000
+_TAKEOFF_NS: Final = 1_000_000_000  # time limit for repeating a take-off that the proxy has not acknowledged
+_BEGUN_NS: Final = 6_000_000_000  # the same once the proxy has acknowledged it
 _numbers = itertools.count(1)
 
 Json = dict[str, Any]
@@ -84,7 +83,7 @@ class ControlSession:
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
         self._steering = False  # whether the newest set-point is a velocity commanded by this page's sticks
-        self._stood_down = False  # whether it stopped commanding the vehicle in mid-flight without resuming since
+        self._stood_down = False  # whether the page stopped commanding in mid-flight and has not resumed since
         self._silence: asyncio.TimerHandle | None = None
         self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
@@ -93,9 +92,8 @@ class ControlSession:
         self._last_command, self._first = ("", 0), 0
         self._decisions = 0  # number of commands so far that fly or end a flight; compared by jobs that have waited
         self._hands = commands.HandWatch()
-        self._awaited: tuple[str, int, frozenset[FlightState], int] | None = (
-            None  # ``do``, ``n``, the states that complete it, and the start time
-        )
+        #: A command that is not complete yet: its ``do`` and ``n``, the states that complete it, and its start time.
+        self._awaited: tuple[str, int, frozenset[FlightState], int] | None = None
         self._repeated = False  # whether the take-off was repeated for as long as allowed
         self._last_refusal = ("", -_REFUSE_AGAIN_S)  # last refusal of a stick command: reason and time [s]
         self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
@@ -106,7 +104,7 @@ class ControlSession:
             commands.HoverHere: self._hover_here,
             commands.LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
             commands.Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
-            commands.Stop: lambda command: self._start_job(self._stop_motors(command)),
+            commands.Stop: lambda command: start_task(self._stop_motors(command), self._jobs),
             Fly: self._fly,
             commands.GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
             commands.FlyBack: lambda command: self._set_out(command, to_start),
@@ -195,7 +193,7 @@ class ControlSession:
         """Send one command, ending the page's previous flight.
 
         The command is complete once it is sent or, if ``until`` contains states, once the vehicle is in one of them.
-        ``act``: sends the command; returns whether it was sent. ``until``: the states that complete the command.
+        ``act``: sends the command; returns whether it was sent.
         """
         pilot = self._held()
         self._send_now(pilot, act, command)
@@ -222,7 +220,6 @@ class ControlSession:
             yield
 
     def _hover_here(self, command: commands.HoverHere) -> None:
-        """Hover because a person requested it, or because the page reports that no key or stick is held."""
         if command.automatic:
             self._held()
             self.let_go("nothing is held on the page")
@@ -369,7 +366,7 @@ class ControlSession:
         self._update()
 
     async def _close_pilot(self) -> None:
-        """Close the page's own connection, which is not needed without authority."""
+        """End the route and close the page's own connection, which is not needed without authority."""
         self._end_route()
         pilot, self._pilot = self._pilot, None
         if pilot is not None:
@@ -377,7 +374,6 @@ class ControlSession:
 
     async def _write(self, command: commands.Write) -> None:
         pilot = self._held()
-
         self._acknowledge(command)
 
         def write() -> Any:
@@ -390,7 +386,7 @@ class ControlSession:
     def _held(self) -> PilotConnection:
         """Return the connection that holds authority.
 
-        Raise ``AuthorityError`` if the page does not hold authority.
+        Raise ``AuthorityError`` if the page does not hold authority, ``RefusedError`` during an emergency stop.
         """
         pilot = self._pilot
         if pilot is None or pilot.authority.state == "none":
@@ -401,10 +397,10 @@ class ControlSession:
         return pilot
 
     def _still_held(self, command: AnyCommand) -> Callable[[], PilotConnection]:
-        """Return a check that replaces :meth:`_held` in a job that waits for responses.
+        """Return a replacement for :meth:`_held` in a job that waits for responses.
 
-        The check raises :class:`RefusedError` if another command has flown or ended a flight since then (the newest
-        decision wins), or if the command is now too old.
+        It also raises :class:`RefusedError` if another command has started or ended a flight since then (the newest
+        decision wins), the page has been silent, or the command is now too old.
         """
         number = self._decisions
 
@@ -441,7 +437,7 @@ class ControlSession:
         return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
     def _end_flight(self, why: str = "another command was given, or the page was silent") -> None:
-        """End the page's previous flight. A route, by contrast, is only paused and can be resumed."""
+        """End the page's previous flight; a route is only paused and can be resumed."""
         self._decisions += 1
         if self._decided != self._last_command:  # earlier intents, and refusals of them, belong to the previous command
             self._last_command, self._first = self._decided, 1 + (self._pilot.intent if self._pilot else 0)
@@ -453,7 +449,7 @@ class ControlSession:
         self._place.cancel()
 
     def let_go(self, why: str) -> None:
-        """Hover if this page is flying the vehicle. A take-off or landing completes safely without the page."""
+        """Hover if the page is flying the vehicle. A take-off or landing continues: it completes without the page."""
         flies = self._is_under_way or self._stood_down
         self._end_flight(why)
         pilot = self._pilot
@@ -512,7 +508,6 @@ class ControlSession:
                     self._done(do, n)
 
     def _on_event(self, event: Event) -> None:
-        """Handle requests to take over control."""
         if self._pilot is not None:
             self._takeover.on_event(event, self._pilot)
 
@@ -553,10 +548,7 @@ class ControlSession:
 
     def _run_in_turn(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         """Start a job that may block, once the jobs started earlier have ended."""
-        self._start_job(self._run(command, work))
-
-    def _start_job(self, work: Coroutine[Any, Any, None]) -> None:
-        start_task(work, self._jobs)
+        start_task(self._run(command, work), self._jobs)
 
     async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:
@@ -580,7 +572,7 @@ def _else_hovering(pilot: PilotConnection, why: str) -> Iterator[None]:
 
 
 def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
-    """Return whether a ping indicates that its page receives no data; such a page hovers before it counts as gone."""
+    """Return whether a ping shows that its page receives no data; its vehicle hovers before the page counts as gone."""
     if not isinstance(command, Alive) or command.seen_s is None:
         return False
     return seconds(now_ns) - command.seen_s > GONE_S - SILENT_S

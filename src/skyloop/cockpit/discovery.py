@@ -1,4 +1,4 @@
-"""Find the proxies on this host and on the network, without being noticed by them."""
+"""Find the proxies on this host and on the network."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class LocalFinder:
     """Finds the proxies on this host that this user can reach."""
 
     def __init__(self, names: Collection[str] = ()) -> None:
-        """Prepare the search. ``names``: the names to search for; if empty, search for all names."""
+        """Prepare the search. ``names``: the names to search for; if empty, all names are searched for."""
         self._names = frozenset(names)
         self._also: set[str] = set()
         self._known: dict[tuple[str, Path], Found] = {}
@@ -50,7 +50,7 @@ class LocalFinder:
         self._also.add(name)
 
     def close(self) -> None:
-        """Do nothing, because nothing was opened."""
+        """Do nothing: each search closes what it opens."""
 
     def __call__(self) -> list[Found]:
         if sys.platform != "linux":  # proxies run on Linux only
@@ -90,7 +90,7 @@ class NetworkFinder:
         self._local = local
         self._settings = settings
         self._wanted = wanted
-        self._lock = threading.Lock()  # guards the following fields, because several threads may search
+        self._lock = threading.Lock()  # guards the settings and the following fields: several threads may search
         self._session: Session | None = None
         self._known: dict[str, Found] = {}
 

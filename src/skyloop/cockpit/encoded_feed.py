@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from skyloop.client.channels import Listener
     from skyloop.client.video import StreamChannel
 
-JPEG_QUALITY = 80
+JPEG_QUALITY = 80  #: quality of full-size JPEG files, 1 to 100
 
 _LENGTH: Final = struct.Struct(">I")
 _encode = msgspec.json.Encoder().encode
@@ -42,7 +42,7 @@ _ENCODER: Final = ThreadPoolExecutor(1, "jpeg", initializer=partial(lower_priori
 KEPT: Final = 16  #: number of pictures kept per stream; a page further behind resumes at a key frame
 SCALES: Final = (0.25, 0.375, 0.5, 0.75, 1.0)  #: only a few scales, so that similar panes share a stream
 RATES: Final = (60, 100, 150, 220, 330, 500, 750, 1100, 1700, 2500, 3700, 5500, 8000)  #: only a few rates [kbit/s]
-BITS: Final = 0.12  #: bits per pixel of a video stream
+BITS: Final = 0.12  #: bits per pixel of a video stream: chosen for a good picture
 _FPS: Final = 30.0  # frame rate assumed for a camera that does not report one
 
 
@@ -81,7 +81,7 @@ class CameraFeed:
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame. The first subscriber opens the camera's subscription."""
+        """Call ``wake`` on the loop for each newer frame, and now if there is one. The first call subscribes."""
         self._wakes.add(wake)
         if self._listener is None:
             loop = asyncio.get_running_loop()
@@ -99,9 +99,9 @@ class CameraFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or the time spent waiting for the first frame.
+        """Age of the newest frame [s] or, until a frame follows a new subscription, the time since then.
 
-        None while no page shows the camera, and before the first frame, which a vehicle may take seconds to send.
+        None while no page shows the camera, and before the very first frame, which a vehicle may take seconds to send.
         """
         if self._listener is None or not self._serial:
             return None
@@ -116,7 +116,6 @@ class CameraFeed:
         return await asyncio.shield(self._jpeg[1])
 
     def close(self) -> None:
-        """Unsubscribe from the camera."""
         if self._listener is not None:
             self._listener.cancel()
             self._listener = None
@@ -131,10 +130,7 @@ class CameraFeed:
 
 
 def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
-    """Encode a frame (BGR) as a JPEG file.
-
-    ``quality``: 1 to 100. Raise ``ValueError`` if OpenCV could not encode the frame.
-    """
+    """Encode a frame (BGR) as a JPEG file; raise ``ValueError`` if OpenCV could not encode it."""
     import cv2
 
     done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -151,7 +147,7 @@ def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
 
 FPS: Final = 12.0  #: maximum frame rate of each camera
 WIDTHS: Final = (160, 240, 320, 480)  #: frame widths [pixels]; the width a page requests is rounded up to one of them
-QUALITY: Final = 70  #: quality of the JPEG files
+QUALITY: Final = 70  #: quality of small JPEG files, 1 to 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,15 +181,11 @@ class SmallFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows the camera."""
         return self._pages > 0
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or the time spent waiting for one.
-
-        None while no page shows the camera, and before the first frame, which a vehicle may take seconds to send.
-        """
+        """Age of the newest frame [s]; see :attr:`CameraFeed.age_s`."""
         if not self.wanted or not self.encoded:
             return None
         newest, now_ns = self.newest, self._clock()
@@ -298,7 +290,6 @@ class EncodedFeed:
 
     @property
     def wanted(self) -> bool:
-        """Whether a page shows these pictures."""
         return bool(self._wakes)
 
     @property
@@ -316,7 +307,7 @@ class EncodedFeed:
 
     @property
     def silent_s(self) -> float:
-        """Time without a picture [s]; 0 if the only page of the stream may simply not be accepting any."""
+        """Time without a picture [s]. 0 once a single page's stream has started: the page may not be accepting any."""
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
@@ -343,7 +334,7 @@ class EncodedFeed:
             )
             self._loop = asyncio.get_running_loop()
             self._came_ns = self._clock()
-            channel.add(self._put, lambda: 0)
+            channel.add(self._put, lambda: 0)  # this consumer misses no sample
             self._channel = channel
         with self._lock:
             self._wakes[page] = wake

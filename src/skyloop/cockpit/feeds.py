@@ -17,14 +17,14 @@ import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyline, Text
-from skyloop.messages.relayed import MOCAP as SERIES
+from skyloop.messages.relayed import MOCAP
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Listener
 
 ROW_HZ: Final = 2.0  #: rate of a drone's feedback while pages show it only as a row of the overview
 Wake = Callable[[], None]
-KEPT_EVENTS = 256
+KEPT_EVENTS = 256  #: maximum number of events kept per drone
 KEPT_S = 10.0  #: older drawings and logs are removed from the display
 MAX_SERIES = 256  #: maximum number of logged series shown per drone
 MAX_SOURCES = 64  #: maximum number of sources of drawings shown per drone, across all of its cameras
@@ -42,7 +42,7 @@ V = TypeVar("V")
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread. Do nothing if the loop is closed and no pages are left."""
+    """Call a function on the loop, from any thread. Do nothing once the loop is closed: no pages are left then."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
 
@@ -72,11 +72,10 @@ class PeriodicBroadcast:
 
     @property
     def wanted(self) -> bool:
-        """Whether there are subscribers."""
         return bool(self._wakes)
 
     def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and at once if one is already fresh, unless the broadcast is closed."""
+        """Call ``wake`` now and for each new message; if the broadcast is closed, only now."""
         if self.closed:
             wake()
             return
@@ -148,7 +147,6 @@ class Newest(Generic[K, V]):
         return [(key, value) for key, (at_ns, value) in list(self._values.items()) if at_ns > oldest_ns]
 
     def clear(self) -> None:
-        """Forget all values."""
         self._values = {}
 
 
@@ -165,7 +163,6 @@ class Drawing:
 
 
 def drawing_values(annotation: Annotation) -> dict[str, Any]:
-    """Return an annotation as JSON values for pages."""
     return {
         "type": "drawing",
         "source": annotation.source,
@@ -185,10 +182,7 @@ def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
 
 
 class EventFeed:
-    """The annotations and events of the drone.
-
-    Events are numbered here, because events created by the client have no number.
-    """
+    """The annotations and events of the drone. Events are numbered here, because those of the client have no number."""
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
         self.drawings: Newest[tuple[str, str], Drawing] = Newest(MAX_SOURCES, clock)  #: keyed by camera and source
@@ -207,7 +201,6 @@ class EventFeed:
         self._wakes.add(wake)
 
     def unsubscribe(self, wake: Wake) -> None:
-        """Stop calling ``wake``."""
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
@@ -215,7 +208,6 @@ class EventFeed:
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
-        """Unregister from the drone."""
         for listener in self._listeners:
             listener.cancel()
 
@@ -252,7 +244,7 @@ class LogFeed:
         self._listeners: list[Listener[Any]] = []
 
     def want(self, wanted: bool) -> None:
-        """Subscribe if the values are wanted; otherwise, unsubscribe and forget the values."""
+        """Subscribe, or unsubscribe and forget the values."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -275,18 +267,12 @@ class LogFeed:
         return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """Return the most recently logged array ``waypoints``, if it was logged within :data:`KEPT_S`.
-
-        Return rows of x, y, z [m] and optionally yaw [rad], in world axes; empty if there are no waypoints.
-        """
+        """Return recently logged waypoints, or nothing: rows of x, y, z [m] and possibly yaw [rad], in world axes."""
         newest = self._waypoints
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
 
     def mocap(self) -> tuple[float, ...] | None:
-        """Return the newest pose from motion capture.
-
-        Return x, y, z [m] and the quaternion x, y, z, w; None if the pose is older than :data:`MOCAP_S`.
-        """
+        """Return a recent motion-capture pose, or None: x, y, z [m] and the quaternion x, y, z, w."""
         newest = self._mocap
         return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None
 
@@ -296,7 +282,7 @@ class LogFeed:
     def _log(self, entry: LogEntry) -> None:
         if entry.number is not None:
             self._numbers.put(entry.name, entry.number)
-        elif entry.values is not None and entry.name == SERIES and len(entry.values) >= 7:
+        elif entry.values is not None and entry.name == MOCAP and len(entry.values) >= 7:
             self._mocap = self._clock(), entry.values
         elif (
             entry.values is not None and entry.name == WAYPOINTS and len(entry.shape) == 2 and entry.shape[1] in (3, 4)

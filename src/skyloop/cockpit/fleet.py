@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.recordings import Recordings
 
-LOOK_S: Final = 0.5
+SEARCH_S: Final = 0.5  #: interval between searches
 FORGET_S: Final = 60.0  #: a drone lost for longer than this is removed from the page
-CONNECT_S: Final = 3.0
+CONNECT_S: Final = 3.0  #: time limit for connecting to a proxy
 OVERVIEW_S: Final = 0.5  #: interval between overviews sent to pages
 FIRST_SEARCH_S: Final = 2.0  #: maximum time that the first pages wait for slow drones
 
@@ -41,16 +41,13 @@ Connect = Callable[[Found], "Drone"]
 _log = logging.getLogger(__name__)
 LANDING_S: Final = 60.0  #: time for which the landing command is repeated
 BEGIN_S: Final = 2.0  #: time limit for opening the connection needed to begin a landing
-_POLL_S: Final = 0.05
+_POLL_S: Final = 0.05  # interval between checks whether a drone has landed
 
 Json = dict[str, Any]
 
 
 def observe(found: Found) -> Drone:
-    """Connect to a proxy as an observer.
-
-    Raise ``SkyloopError`` if the connection was not established within :data:`CONNECT_S`.
-    """
+    """Connect to a proxy as an observer; raise ``SkyloopError`` if that takes longer than :data:`CONNECT_S`."""
     from skyloop.client.drone import open_drone
 
     return open_drone(found.dial, app="cockpit", access="observe", timeout_s=CONNECT_S)
@@ -69,7 +66,7 @@ class Fleet:
         *,
         kept: Collection[str] = (),
         clock: Clock = monotonic_ns,
-        look_s: float = LOOK_S,
+        search_s: float = SEARCH_S,
     ) -> None:
         self.finder = finder
         self.stations: dict[str, Station] = {}
@@ -77,7 +74,7 @@ class Fleet:
         self._connect = connect
         self._kept = frozenset(kept)
         self._clock = clock
-        self._search_period_s = look_s
+        self._search_s = search_s
         self._seen_ns: dict[str, int] = {}
         self._found: dict[str, Found] = {}  # the proxies found by the last search
         self._connecting: dict[str, asyncio.Task[None]] = {}
@@ -109,7 +106,7 @@ class Fleet:
         start_task(work, self._begun)
 
     async def search(self) -> None:
-        """Search once: start connecting to new proxies, and remove those that are gone permanently."""
+        """Search once: start connecting to new proxies, and remove drones that have been lost for a long time."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -151,7 +148,7 @@ class Fleet:
 
     async def _watch(self) -> None:
         while True:
-            await asyncio.sleep(self._search_period_s)
+            await asyncio.sleep(self._search_s)
             try:
                 await self.search()
             except (SkyloopError, OSError) as error:
@@ -163,7 +160,7 @@ class Fleet:
         try:
             drone = await asyncio.to_thread(self._connect, found)
         except SkyloopError as error:
-            self.problems[found.name] = str(error)  # this will be retried in the next search
+            self.problems[found.name] = str(error)  # the next search tries again
         else:
             self.problems.pop(found.name, None)
             self.stations[found.name] = Station(found, drone)
@@ -219,7 +216,6 @@ class FleetSession:
     """Serves one socket of a pilot's page; its commands complete even if the page goes away. Used on the event loop."""
 
     def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
-        """Prepare the session; :meth:`run` serves it."""
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._fleet = fleet
@@ -227,7 +223,6 @@ class FleetSession:
         self._clock = clock
 
     async def run(self) -> None:
-        """Serve the page until it disconnects."""
         await self._page.serve(self._on_messages)
 
     def _on_messages(self, texts: Sequence[str | bytes]) -> None:

@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 STOPPED_S: Final = 0.5  #: the vehicle hovers if no new frame arrives for this long
 OLD_S: Final = 1.0  #: the vehicle also hovers if a frame is older than this when it is tracked
-OLD_FEEDBACK_S: Final = 1.0
+OLD_FEEDBACK_S: Final = 1.0  #: following ends if the feedback is older than this
 #: Maximum age of a request that may start a flight: when it is older, the tracker is stuck or nobody expects a flight.
 SET_OFF_S: Final = 10.0
 WATCH_S: Final = 0.1  #: interval between checks whether the tracker still reports
 NUMBERS_PERIOD_S: Final = 0.2  #: interval between messages that differ only in numbers
-JOIN_S: Final = 2.0
+JOIN_S: Final = 2.0  #: time limit for a tracker's thread to end
 NO_CONTROL: Final = "this page has lost control"
 _WHAT: Final = "following a target"
 
@@ -104,10 +104,7 @@ class FollowSession:
     # Requests from the page ------------------------------------------------------------------------------------
 
     async def select(self, command: SelectTarget) -> None:
-        """Keep the frames of a camera until a box arrives or the page cancels.
-
-        Raise ``UnknownNameError`` if the vehicle has no such camera.
-        """
+        """Keep a camera's frames until a box arrives or the page cancels; raise ``UnknownNameError`` if unknown."""
         if self._keeper is not None:
             self._keeper.close()
             self._keeper = None
@@ -187,7 +184,7 @@ class FollowSession:
         self._send_state()
 
     def interrupt(self, why: str) -> None:
-        """End the flight because another command was given or control was lost; tracking continues."""
+        """End following, because another command was given or control was lost; a merely tracked target is kept."""
         if self._pilot is not None:
             self.end(why, hover=False)
 
@@ -249,7 +246,10 @@ class FollowSession:
             self._steer(self._report.action)
 
     def _steer(self, action: AnyAction | None) -> None:
-        """Send a set-point; hover if there are no new frames or the motion is unknown. Raise on the first problem."""
+        """Send a set-point; hover if there are no new frames or the motion is unknown. On any problem, end following.
+
+        ``action``: None if the tracker sends no reports.
+        """
         pilot = self._pilot
         assert pilot is not None
         waited, self._waits = self._waits, self._stopped() or ("" if action else "the tracker is not reporting")
@@ -271,7 +271,7 @@ class FollowSession:
             self.end(str(error))
 
     def _stopped(self) -> str:
-        """Return why flying is impossible (no frames, or the vehicle's motion is unknown); empty if it is possible."""
+        """Return why the vehicle can't follow now (no frames, or its motion is unknown); empty if it can."""
         report = self._report
         if report is None:
             return ""

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from skyloop.control.route import Route
 
 GOTO_M_S: Final = 1.0  #: maximum speed on the way to a place
+OLD_S: Final = 1.0  #: a flight to a place ends, and a route is paused, if the feedback is older than this
 PERIOD_S: Final = 0.05  #: interval between checks whether the drone has arrived
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 
@@ -103,7 +104,7 @@ class PlaceFlight:
 
     async def _watch(self, command: AnyCommand, pilot: PilotConnection, leg: Leg) -> None:
         try:
-            while not leg.is_over(feedback := pilot.feedback(max_age_s=1.0)):
+            while not leg.is_over(feedback := pilot.feedback(max_age_s=OLD_S)):
                 if feedback.others:
                     raise RefusedError(feedback.others)
                 if pilot.has_ended(leg.action):
@@ -131,9 +132,6 @@ def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
     if not feedback.state.airborne:
         raise RefusedError(f"{what}: it is not in the air, take off first")
     return feedback
-
-
-OLD_S: Final = 1.0  #: a route is paused if the feedback is older than this
 
 
 class RouteSession:
@@ -182,7 +180,7 @@ class RouteSession:
         self._ask(self.law.skip)
 
     def end(self, *, hover: bool = True) -> None:
-        """End the route permanently. ``hover``: False if another command was given or control was lost."""
+        """End the route permanently; see :meth:`pause` for ``hover``."""
         if self._job is not None:
             self._job.cancel()
         self._carry_out(self.law.stop(), send=hover)
@@ -227,7 +225,7 @@ class RouteSession:
 
     def _command(self, action: Position | Hover | Land, *, automatic: bool) -> None:
         pilot = self._pilot
-        if automatic and not isinstance(action, Position):  # this was caused by the end of the route, not by a person
+        if automatic and not isinstance(action, Position):  # the route has ended; no person commanded this
             pilot.let_go("its route ended", land=isinstance(action, Land))
             return
         if pilot.command(action):

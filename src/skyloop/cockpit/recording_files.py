@@ -28,7 +28,7 @@ MAX_NAME_BYTES: Final = 200  #: maximum length of a name; file systems allow 255
 MAX_TEXT: Final = 4000  #: maximum length of a note [characters]
 MAX_MARK: Final = 200  #: maximum length of a mark [characters]
 MAX_MARKS: Final = 200  #: maximum number of marks per recording
-MAX_AT_S: Final = 1e6
+MAX_AT_S: Final = 1e6  #: latest position of a mark; longer than any recording
 _MOST_BYTES: Final = 1 << 20  #: maximum size of a notes file
 _NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and characters that other systems forbid
 
@@ -48,10 +48,7 @@ class Notes(msgspec.Struct, frozen=True):
 
 
 def check_name(text: str) -> str:
-    """Return the file name, including suffix, for a recording's name typed by a person.
-
-    Raise ``UsageError`` if the name is invalid; the message says why.
-    """
+    """Return the file name, with suffix, for a name typed by a person; raise ``UsageError`` if the name is invalid."""
     name = unicodedata.normalize("NFC", text).strip()
     name = name.removesuffix(ENDING).rstrip()
     for character in name:
@@ -69,7 +66,6 @@ def check_name(text: str) -> str:
 
 
 def notes_path(path: Path) -> Path:
-    """Return the path of a recording's notes."""
     return path.with_name(path.name.removesuffix(ENDING) + NOTES_ENDING)
 
 

@@ -75,10 +75,7 @@ def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
 
 
 def start_replay(path: Path, drone: str | None = None) -> Drone:
-    """Start a private proxy that plays a file, and connect to the proxy.
-
-    ``drone``: the recorded drone to play, or None for the first drone.
-    """
+    """Start a private proxy that plays a file, and connect to it. ``drone``: whose recording; None for the first."""
     from skyloop.client import connect
 
     which = "" if drone is None else f"?drone={quote(drone)}"
@@ -93,8 +90,6 @@ def start_replay(path: Path, drone: str | None = None) -> Drone:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """A running replay."""
-
     drone: Drone  #: the observer whose connection keeps the replay's proxy running
     path: Path
     recorded: str | None  #: the drone's name in the recording; None for the first drone
@@ -117,7 +112,7 @@ Json = dict[str, Any]
 T = TypeVar("T")
 
 MAX_CHILDREN: Final = 8  #: maximum number of simultaneous recordings, and of replays; each one is a process
-MOST_LISTED: Final = 500
+MOST_LISTED: Final = 500  #: maximum number of recordings listed, newest first
 NOTE_SHOWN: Final = 200  #: maximum number of characters of a note that the list shows
 
 
@@ -139,11 +134,11 @@ class Recordings:
         self._record = record
         self._replay = replay
         self.reports = Reports()
-        self._timelines = Reports(timeline_command, "time line")
+        self._timelines = Reports(partial(_child, TIMELINE), "time line")
         self._made: dict[tuple[Path, float, str | None], str] = {}  # timelines, from oldest to newest
-        self._changing = asyncio.Lock()
-        self._starting = asyncio.Lock()
-        self._looking = asyncio.Lock()
+        self._starting = asyncio.Lock()  # held while a recording or replay starts
+        self._changing = asyncio.Lock()  # held while files change; acquired after ``_starting`` if both are needed
+        self._listing = asyncio.Lock()
         self._running: dict[str, Running] = {}
         self._numbers = itertools.count(1)
         self._known: dict[tuple[Path, int, int], Described] = {}  # descriptions of files, by path, size and time
@@ -173,10 +168,7 @@ class Recordings:
             return self._entry(number)
 
     async def stop(self, number: str) -> Json:
-        """Stop a recording and wait until its file is closed.
-
-        Raise ``UnknownNameError`` if no such recording is running.
-        """
+        """Stop a recording and wait until its file is closed; raise ``UnknownNameError`` if it is not running."""
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
         entry = self._entry(number)
@@ -187,7 +179,7 @@ class Recordings:
     async def listing(self) -> Json:
         """Return the running recordings and those in the folder, newest first."""
         running = [self._entry(number) for number in self._running]
-        async with self._looking:  # several simultaneous requests cost no more than one
+        async with self._listing:  # simultaneous requests occupy one thread, and reuse each other's descriptions
             past = await asyncio.to_thread(self._past)
             trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
         return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
@@ -205,10 +197,7 @@ class Recordings:
     # Files -----------------------------------------------------------------------------------------------------
 
     async def path(self, name: str) -> Path:
-        """Return the path of a recording.
-
-        Raise ``UnknownNameError`` if the file does not exist or is being recorded.
-        """
+        """Return the path of a recording; raise ``UnknownNameError`` if it does not exist or is being recorded."""
         return await asyncio.to_thread(self._path, name)
 
     async def move(self, name: str, change: Callable[[Path], str]) -> str:
@@ -262,9 +251,8 @@ class Recordings:
             return drone.name
 
     async def replayed(self, name: str) -> Json:
-        """Return the data of the recording that the page's replay bar needs.
+        """Return what the page's replay bar needs, as JSON values: the file's name, its :func:`timeline` and its notes.
 
-        Return the file's name, the result of :func:`skyloop.cockpit.recordings.timeline` and the notes, as JSON values.
         Raise ``UnknownNameError`` if no such replay was started here.
         """
         if name not in self.replays:
@@ -363,11 +351,6 @@ Command = Callable[[Path, Path, str | None], Sequence[str]]
 def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
     """Return the command line of the child process that creates a report."""
     return _child(REPORT, file, target, drone)
-
-
-def timeline_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
-    """Return the command for the child that writes the result of :func:`timeline` as JSON."""
-    return _child(TIMELINE, file, target, drone)
 
 
 def _child(what: str, file: Path, target: Path, drone: str | None) -> Sequence[str]:
@@ -482,10 +465,10 @@ def _report(recording: Recording, drone: str, target: Path) -> None:
 
 MARK: Final = "mark"  #: name under which marks are logged
 MAX_EVENTS: Final = 300  #: if there are more events, the most severe are kept
-MAX_MARKS: Final = 300
-MAX_SAMPLES: Final = 1200
+MAX_MARKS: Final = 300  #: maximum number of marks; the first ones are kept
+MAX_SAMPLES: Final = 1200  #: maximum number of samples; a long recording is sampled less often
 PERIOD_S: Final = 0.1  #: minimum time between samples
-MAX_TEXT: Final = 200
+MAX_TEXT: Final = 200  #: maximum length of a text [characters]
 _SEVERITIES: Final = (Severity.ERROR, Severity.WARNING)
 #: Events that are irrelevant to the flight.
 _LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})

@@ -88,7 +88,6 @@ class RecordingsApi:
 
     @answered
     async def recordings(self, _: Request) -> Response:
-        """Respond with the running and finished recordings."""
         return answer_json(await self._recordings.listing())
 
     @answered
@@ -130,7 +129,6 @@ class RecordingsApi:
 
     @answered
     async def notes(self, request: Request) -> Response:
-        """Respond with the notes of a recording."""
         path = await self._recordings.path(request.path_params["name"])
         return answer_json(await asyncio.to_thread(recording_files.read_notes, path))
 

@@ -13,32 +13,25 @@ import msgspec
 from skyloop.control.route import ENDING, Route, RouteCheck, checked, load_route, save_route
 from skyloop.errors import RefusedError, SkyloopError, UnknownNameError, UsageError
 
-MOST_FILES: Final = 200
-MOST_CHECKED: Final = 16
+MOST_FILES: Final = 200  #: maximum number of routes in the folder
+MOST_CHECKED: Final = 16  #: maximum number of checked routes per drone; the one checked longest ago is dropped first
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,47}")
 
 Json = dict[str, Any]
 
 
 class RouteFiles:
-    """The routes in one folder, each in a file ``NAME.route.json``. Methods access files, so call them on a thread.
-
-    ``folder``: created when needed.
-    """
+    """A folder of routes, created when needed, each in a file ``NAME.route.json``. Its methods block: use a thread."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def listing(self) -> Json:
         """Return the routes as JSON values, by name; for an unreadable file, return the problem instead."""
-        files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
-        return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
+        return {"folder": str(self.folder), "routes": [self._entry(path) for path in self._files()[:MOST_FILES]]}
 
     def load(self, name: str) -> Route:
-        """Read a route.
-
-        Raise ``UnknownNameError`` if there is no route with that name, and ``SkyloopError`` if the file can't be read.
-        """
+        """Read a route; raise ``UnknownNameError`` without one, another ``SkyloopError`` if name or file is invalid."""
         path = self._path(name)
         if not path.is_file():
             raise UnknownNameError("route", name, [one.name.removesuffix(ENDING) for one in self._files()])
@@ -105,10 +98,7 @@ class CheckedRoutes:
         return {"id": number, "ok": check.ok, **msgspec.to_builtins(check)}
 
     def get(self, number: str) -> Route:
-        """Return a checked route.
-
-        Raise ``RefusedError`` if the route was not checked, or if too many other routes have been checked since.
-        """
+        """Return a checked route; raise ``RefusedError`` if it was not checked, or too many have been checked since."""
         if number not in self._routes:
             raise RefusedError("this route was not checked recently: check it again")
         return self._routes[number]

@@ -41,10 +41,7 @@ _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
 def bind_address(host: str) -> tuple[str, bool]:
-    """Return the address to bind to, and whether it is a loopback address.
-
-    Raise ``UsageError`` if the text is not an address.
-    """
+    """Return the address to bind to and whether it is a loopback address; raise ``UsageError`` if it is no address."""
     if host == "localhost":
         return "127.0.0.1", True
     try:
@@ -85,7 +82,7 @@ class Names:
 
 
 def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
-    """Return the names by which a server can be reached. ``more``: other host names that browsers use to reach it."""
+    """Return the names by which browsers reach a server. ``more``: host names in addition to its own address."""
     known = ipaddress.ip_address(address)
     bare = {name.lower() for name in more}
     if known.is_loopback:
@@ -183,11 +180,7 @@ def person_of(scope: Scope) -> Person | None:
 
 
 async def gone_within(receive: Receive, within_s: float) -> bool:
-    """Wait for the client to disconnect.
-
-    ``receive``: the request's ``receive`` function; messages other than the disconnect are dropped. Return whether
-    the client disconnected in time.
-    """
+    """Wait for the client to disconnect, dropping its messages; return whether it disconnected in time."""
     try:
         async with asyncio.timeout(within_s):
             while not (await receive())["type"].endswith(".disconnect"):

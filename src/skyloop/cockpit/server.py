@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 
 RECORDINGS = Path("recordings")  #: the default folder for recordings
 _LARGEST_MESSAGE = 4096  # maximum size of a message from a page [bytes]
-_LOOK_S = 0.05  # interval between checks whether ``stop`` is set
-_PING_S = 10.0  # a connection that does not answer for this long is closed
+_POLL_S = 0.05  # interval between checks whether ``stop`` is set
+_PING_S = 10.0  # interval between pings on a WebSocket; one that does not answer for as long is closed
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,11 +187,11 @@ def with_certificate(access: Access, directory: Path) -> Access:
     """Return the same access over https, with a certificate for this machine that is created or renewed if necessary.
 
     Args:
-        access: Access settings that have no certificate yet.
-        directory: Contains certificates and their authority (:mod:`skyloop.network.keys.lab`).
+        access: The settings to complete.
+        directory: Folder for the certificate and its authority (:mod:`skyloop.network.keys.lab`).
 
     Raises:
-        UsageError: The access already has a certificate, the address can't be certified, or a file is invalid.
+        UsageError: ``access`` already names a certificate, the address can't be certified, or a file is invalid.
         MissingExtraError: The extra ``network`` is not installed.
     """
     from skyloop.cockpit.security import bind_address
@@ -252,7 +252,7 @@ def _gate(access: Access, port: int) -> Gate:
 
 
 def _session_file(cookie: str) -> SessionFile | None:
-    """Return the file that keeps sessions between runs; None if no folder belongs to this user alone."""
+    """Return the file that keeps sessions between runs; None except on Linux."""
     if sys.platform != "linux":
         return None
     from skyloop.cockpit.access import SessionFile
@@ -292,11 +292,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
     from skyloop.cockpit.security import ADMIT
 
     class Protocol(H11Protocol):
-        """uvicorn's protocol, which also informs the application and the admission.
-
-        The application receives the client's certificate, which uvicorn does not pass on; the admission is informed of
-        the connection's progress.
-        """
+        """uvicorn's protocol, which also passes on the client's certificate and reports progress to the admission."""
 
         def __init__(self, connection: Connection) -> None:
             super().__init__(server.config, server.server_state, server.lifespan.state)
@@ -355,21 +351,21 @@ async def _run(
     listener: Listener,
     on_ready: Callable[[], None],
     stop: threading.Event | None,
-    look: Callable[[], None],
+    expire_codes: Callable[[], None],
 ) -> None:
     ending = asyncio.Event()
     if threading.current_thread() is threading.main_thread():
         on_signals((signal.SIGINT, signal.SIGTERM), ending.set)
     serving = asyncio.create_task(server.serve(sockets=[]))
     while not server.started and not serving.done():
-        await asyncio.sleep(_LOOK_S / 10)
+        await asyncio.sleep(_POLL_S / 10)
     listening = asyncio.create_task(listener.run())
     await asyncio.sleep(0)  # the first step of the event loop starts listening
     if not serving.done():
         on_ready()
     while not serving.done():
-        await asyncio.wait([serving], timeout=_LOOK_S)
-        look()
+        await asyncio.wait([serving], timeout=_POLL_S)
+        expire_codes()
         if ending.is_set() or listening.done() or (stop is not None and stop.is_set()):
             listening.cancel()
             server.should_exit = True

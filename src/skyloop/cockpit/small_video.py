@@ -28,29 +28,21 @@ if TYPE_CHECKING:
 SEND_HZ: Final = 60.0  #: maximum number of messages per second
 GATHER_S: Final = 0.005  #: time for which a picture waits for pictures of other cameras, which often arrive together
 MAX_SHOWN: Final = 64  #: maximum number of cameras shown on one page at a time
-_BAD_MESSAGE: Final = 1008
+_BAD_MESSAGE: Final = 1008  # WebSocket close code: policy violation (RFC 6455)
 
 
 class _Place(msgspec.Struct, frozen=True):
-    """A camera of a drone."""
-
     drone: str
     camera: str
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """A message from a page.
-
-    The page starts showing a camera (``width`` pixels wide, ``h264`` if it decodes H.264) or stops showing it; it can't
-    decode a camera's pictures until the next key frame (``key``); or it acknowledges what it has drawn.
-    """
-
-    show: _Place | None = None
-    hide: _Place | None = None
-    width: int = 0
-    h264: bool = False
-    key: _Place | None = None
-    ack: int | None = None
+    show: _Place | None = None  #: show this camera
+    hide: _Place | None = None  #: stop showing this camera
+    width: int = 0  #: with ``show``: width of the pane [device pixels]
+    h264: bool = False  #: with ``show``: whether the page decodes H.264
+    key: _Place | None = None  #: the page can't decode this camera's pictures until the next key frame
+    ack: int | None = None  #: number of the message that the page has drawn
 
 
 @dataclass(slots=True)
@@ -65,10 +57,7 @@ class _Shown:
     sent: int = 0  #: serial number of the last JPEG sent
 
     def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
-        """Subscribe to the camera; also called after the drone has been reconnected or replaced.
-
-        JPEGs are subscribed to only while nothing else is shown.
-        """
+        """Subscribe to the camera, again if the drone was replaced; to JPEGs only while nothing else is shown."""
         if station is not self.station:
             self.release()
             self.station = station
@@ -88,13 +77,11 @@ class _Shown:
                     self.feed, self.sent = feed, 0
 
     def release_feed(self) -> None:
-        """Unsubscribe from JPEGs."""
         if self.feed is not None:
             self.feed.unsubscribe()
             self.feed = None
 
     def release(self) -> None:
-        """Unsubscribe from the camera."""
         self.release_feed()
         if self.stream is not None:
             self.stream.close()
@@ -102,7 +89,7 @@ class _Shown:
 
 
 class SmallVideoSender:
-    """Sends one page the newest frame of each camera that it shows, in one message, until the page disconnects.
+    """Sends one page the new frames of all cameras that it shows in one message, until the page disconnects.
 
     The next message is sent once the page has drawn the previous one. A slow page therefore receives fewer frames, but
     never older ones, and does not delay other pages.
@@ -119,7 +106,6 @@ class SmallVideoSender:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
         due_s = time.monotonic()

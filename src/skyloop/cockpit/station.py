@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from skyloop.client import Listener
     from skyloop.messages import Feedback
 
-TELEMETRY_HZ: Final = 18.0
+TELEMETRY_HZ: Final = 18.0  #: rate of the states sent to pages
 FRESH_S: Final = 0.2  #: time to wait for fresh feedback
 PILOT_S: Final = 2.0  #: time limit for opening a pilot's connection
 RECORDINGS: Final = ("replay:", "video:")  #: address prefixes of recorded drones
@@ -78,10 +78,7 @@ class PilotConnection(Drone):
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
-        """Answer a request for authority and wait until the proxy has received the answer.
-
-        Raise ``RefusedError`` if this connection no longer holds authority.
-        """
+        """Answer a request for authority, and wait for the proxy; raise ``RefusedError`` without authority."""
         commands(self).answer(lease, app_id, grant, reason, wait=True)
 
     @property
@@ -96,7 +93,7 @@ class PilotConnection(Drone):
         return sent
 
     def has_ended(self, action: AnyAction) -> bool:
-        """Whether a failsafe, a lost link or a lost lease has ended this action; if so, it could now be sent again."""
+        """Whether a failsafe, a lost link or a lost lease has ended this action and it could now be sent again."""
         newest, intent = self._newest
         outcome = commands(self).outcome(intent) if newest is action else None
         return outcome is not None and outcome.fate in OVERRULED and commands(self).may_ask
@@ -107,11 +104,14 @@ class PilotConnection(Drone):
         return commands(self).intent
 
     def refusal(self, first: int) -> Outcome | None:
-        """The outcome of a refused or ended command with at least this number, unless :meth:`has_ended` covers it."""
-        told = commands(self).newest_outcome
-        if told is None or told.reason is None or told.intent < first or told.fate in (*OUTDONE, *OVERRULED):
+        """The newest outcome, if it is a refusal of a command with at least this number; None otherwise.
+
+        An action that its application replaced or withdrew was not refused, nor was one that :meth:`has_ended` covers.
+        """
+        found = commands(self).newest_outcome
+        if found is None or found.reason is None or found.intent < first or found.fate in (*OUTDONE, *OVERRULED):
             return None
-        return told
+        return found
 
     @property
     def is_acknowledged(self) -> bool:
@@ -263,10 +263,7 @@ class Station:
     # Pilots ----------------------------------------------------------------------------------------------------
 
     async def open_pilot(self, app: str) -> PilotConnection:
-        """Open a connection for a pilot, without requesting authority yet.
-
-        Raise ``SkyloopError`` if the connection can't be opened within :data:`PILOT_S`.
-        """
+        """Open a pilot's connection, without authority; raise ``SkyloopError`` after :data:`PILOT_S`."""
 
         def connect() -> PilotConnection:
             return PilotConnection.open(self.found.dial, app, PILOT_S)
@@ -308,7 +305,7 @@ class Station:
             sent: Called once the stop has been sent.
 
         Raises:
-            LinkError: The stop was not sent and never will be sent.
+            LinkError: The stop was not sent, and no longer will be.
             NoAnswerError: The vehicle does not report that its motors have stopped within :data:`SHOWN_S`.
             UnsupportedError: The vehicle has no emergency stop.
         """
@@ -330,7 +327,7 @@ class Station:
             self._stops -= 1
 
     def check_stop(self) -> None:
-        """Raise :class:`RefusedError` as long as the vehicle has not reported the result of an emergency stop."""
+        """Raise :class:`RefusedError` while an emergency stop is under way."""
         if self._stops:
             raise RefusedError("an emergency stop is under way: other commands wait until the vehicle shows it")
 

@@ -2,7 +2,7 @@
 
 Video: only one JPEG is in flight at a time; the page gets the newest after it has drawn and acknowledged the previous.
 Several H.264 pictures may be in flight, because they depend on each other; after a gap, a page needs a key frame.
-Telemetry: the newest state about 20 times a second, or as fast as the socket accepts it, created once for all pages.
+Telemetry: the newest state 18 times a second, or as fast as the socket accepts it, created once for all pages.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 LATE_S: Final = 0.25  #: a picture counts as late if it is acknowledged after more than this time
 FALLS_BEHIND_S: Final = 1.0  #: a page gets its own stream if all of its pictures were late for this long
 QUIET_S: Final = 10.0  #: time without late pictures before a page shares a stream again; doubled after each relapse
-MOST_QUIET_S: Final = 160.0
+MOST_QUIET_S: Final = 160.0  #: maximum of this time
 SILENT_S: Final = 3.0  #: give up on a stream after this long without a picture
 RETRY_S: Final = 10.0  #: first pause before the stream is tried again; doubled each time
 MOST_RETRY_S: Final = 300.0  #: longest pause; a proxy that refuses the stream reports each attempt
@@ -47,7 +47,7 @@ MOST_BYTES: Final = 1_000_000  #: maximum total size of these pictures [bytes]; 
 
 
 class PagePath:
-    """Decides from a page's acknowledgements whether the page keeps up. Pure; takes the time as an argument."""
+    """Decides from a page's acknowledgements whether the page keeps up. Takes the time as an argument."""
 
     def __init__(self) -> None:
         self.behind = False  #: whether the page needs a lower rate than other pages get
@@ -57,7 +57,7 @@ class PagePath:
         self._changed_ns: int | None = None  # time of the last change of ``_was_late``
         self._was_late = False
         self._quiet_s = QUIET_S
-        self._back_ns: int | None = None
+        self._back_ns: int | None = None  # time at which the page last caught up
 
     @property
     def free(self) -> bool:
@@ -83,10 +83,7 @@ class PagePath:
         return count
 
     def update(self, now_ns: int, extra_s: float = 0.0) -> bool:
-        """Update the assessment; return whether the page is behind.
-
-        ``extra_s``: time it takes pictures to reach the cockpit [s].
-        """
+        """Return whether the page is behind now. ``extra_s``: time it takes pictures to reach the cockpit [s]."""
         oldest_s = seconds(now_ns - self._under_way[0][2]) if self._under_way else 0.0
         late = max(oldest_s, self._trip_s, extra_s) > LATE_S
         if self._changed_ns is None or late != self._was_late:
@@ -145,7 +142,7 @@ class PageStream:
         self._numbers: deque[tuple[int, EncodedFeed, int]] = deque()  # message number, feed and picture number
         self._late_s = 0.0  # delay of the newest picture on its arrival in the cockpit
         self._missed = 0  # number of pictures skipped before those that are ready
-        self._refused_ns: int | None = None
+        self._refused_ns: int | None = None  # time at which a stream was last given up
         self._retry_s = RETRY_S
 
     @property
@@ -158,7 +155,7 @@ class PageStream:
         self._width = width
 
     def take(self) -> list[Sent]:
-        """Return the pictures to send now, in order, and mark them as sent; report their numbers to :meth:`sent`."""
+        """Return the pictures to send now, in order, and mark them as sent; the caller must call :meth:`sent`."""
         self._choose()
         if self._next is not None and self._ready(self._next, 0):
             self._release(self._feed)
@@ -180,13 +177,13 @@ class PageStream:
         return [Sent(one.picture, form, seconds(now_ns - one.picture.captured_ns), late) for one in pictures]
 
     def sent(self, number: int, one: Sent) -> None:
-        """Record the message number of pictures from :meth:`take`."""
+        """Record the number of the message that contains a picture from :meth:`take`."""
         if self._feed is not None:
             self._numbers.append((number, self._feed, one.picture.seq))
             self.path.sent(number, len(one.picture.data), self._clock())
 
     def acknowledged(self, number: int) -> int:
-        """Handle the page's report that it has drawn or skipped pictures; return how many were newly reported."""
+        """Handle the page's report that it has received this message and all earlier ones; return how many are new."""
         newest = None
         while self._numbers and self._numbers[0][0] <= number:
             newest = self._numbers.popleft()
@@ -262,8 +259,8 @@ DRAWN_BYTES = 65_536  #: maximum size of the drawings sent to a page with one fr
 MAX_WAITING: Final = 256  #: number of responses queued for a page that does not read; further responses are dropped
 MAX_COUNTED = 256  #: maximum number of sources of drawings listed in the counts
 
-_BAD_MESSAGE = 1008
-_LOOK_S: Final = 0.2
+_BAD_MESSAGE = 1008  # close code: policy violation (RFC 6455)
+_POLL_S: Final = 0.2  # longest time between checks that an H.264 stream still delivers pictures
 UNKNOWN = 4404  #: close code: there is no such drone or camera
 
 
@@ -297,7 +294,6 @@ class VideoSender:
         self._drawn: dict[str, int] = {}  # capture times of the drawings sent last, by source in the order of sending
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         self._event_feed.subscribe(self._wake.set)
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
@@ -306,7 +302,7 @@ class VideoSender:
                 self._choose()
                 with suppress(TimeoutError):
                     # Wake up regularly, to detect that no pictures are arriving or that the page is not accepting any.
-                    await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _LOOK_S)
+                    await asyncio.wait_for(self._wake.wait(), None if self._stream is None else _POLL_S)
                 self._wake.clear()
                 await self._send_pictures()
                 await self._send_frame()
@@ -339,18 +335,18 @@ class VideoSender:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
                 return True
-            said = _said(message.get("text") or "")
-            if said is None:
+            decoded = _decode(message.get("text") or "")
+            if decoded is None:
                 return False
-            if said.h264 is not None:
-                self._take_form(said.h264, said.width)
-            if said.ack is not None:
-                self._acknowledged(said.ack)
-            if said.key and self._stream is not None:
+            if decoded.h264 is not None:
+                self._set_encoding(decoded.h264, decoded.width)
+            if decoded.ack is not None:
+                self._acknowledged(decoded.ack)
+            if decoded.key and self._stream is not None:
                 self._stream.restart()
             self._wake.set()
 
-    def _take_form(self, h264: bool, width: int) -> None:
+    def _set_encoding(self, h264: bool, width: int) -> None:
         if not h264:
             if self._stream is not None:
                 self._stream.close()
@@ -439,11 +435,9 @@ class BroadcastSender:
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Send until the page disconnects."""
         gone = asyncio.create_task(self._until_gone())
         gone.add_done_callback(lambda _: self._wake.set())
-        wake = self._wake.set  # unsubscribing requires the same object
-        self._broadcast.subscribe(wake)
+        self._broadcast.subscribe(self._wake.set)
         try:
             while not gone.done() and not self._broadcast.closed:
                 await self._wake.wait()
@@ -457,7 +451,7 @@ class BroadcastSender:
         except WebSocketDisconnect:
             pass  # the page disconnected during a send
         finally:
-            self._broadcast.unsubscribe(wake)
+            self._broadcast.unsubscribe(self._wake.set)
             gone.cancel()
             await asyncio.gather(gone, return_exceptions=True)
 
@@ -498,7 +492,7 @@ class PageSocket:
         self._outbox: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
 
     def send(self, message: dict[str, Any]) -> None:
-        """Queue a message; drop it if the page has not read the last :data:`MAX_WAITING` messages."""
+        """Queue a message; drop it if :data:`MAX_WAITING` messages are already queued."""
         with suppress(asyncio.QueueFull):
             self._outbox.put_nowait(message)
 
@@ -536,30 +530,26 @@ class PageSocket:
 
 
 class _FromPage(msgspec.Struct):
-    """A message from a page: pictures drawn, picture kinds accepted, or a picture that it can't decode."""
-
-    ack: int | None = None
-    h264: bool | None = None
-    width: int = 0
-    key: bool = False
+    ack: int | None = None  #: number of the newest picture that the page has drawn
+    h264: bool | None = None  #: whether the page decodes H.264
+    width: int = 0  #: with ``h264``: width of the pane [device pixels]; 0 for full size
+    key: bool = False  #: whether the page can't decode any picture until the next key frame
 
 
-def _said(text: str) -> _FromPage | None:
+def _decode(text: str) -> _FromPage | None:
     """Decode a page's message; return None if it is invalid."""
     try:
-        said = msgspec.json.decode(text, type=_FromPage)
+        message = msgspec.json.decode(text, type=_FromPage)
     except msgspec.DecodeError:
         return None
-    return said if said.ack is not None or said.h264 is not None or said.key else None
+    return message if message.ack is not None or message.h264 is not None or message.key else None
 
 
 def picture_values(picture: Frame | SmallFrame | EncodedFrame, age_s: float, width: int, height: int) -> dict[str, Any]:
-    """Return a picture's description for pages, as JSON values."""
     captured = str(picture.captured_ns)  # too large for a JavaScript number
     return {"seq": picture.seq, "captured_ns": captured, "age_s": age_s, "width": width, "height": height}
 
 
 def encoding_values(one: Sent) -> dict[str, Any]:
-    """Return how a picture is encoded, as JSON values for a page."""
     values = {"key": one.picture.key, "kind": one.form.kind, "kbit_s": one.form.kbit_s}
     return values | {"late": True} if one.form.subscriber and one.late_here else values

@@ -118,14 +118,13 @@ class QueueTracker:
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
-        """Handle an event received by the application with this number."""
         if event.kind is EventKind.AUTHORITY_DECLINED and event.data.get("app_id") == app_id:
             self._declined = str(event.data.get("reason", ""))
 
     def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
-        """Return the page's position in the queue.
+        """Return the page's position in the queue, or None if the page is not waiting.
 
-        Return None if the page is not waiting. Otherwise, the value changes only when the status changes.
+        The time at which its turn is expected is fixed until the status changes.
         """
         if status.state == "held":  # a pilot that was overruled regains authority later without asking
             self.request(ask=False)
@@ -148,7 +147,6 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Start over, because the page has requested authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:
@@ -181,7 +179,7 @@ GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later los
 class AuthorityReport:
     """Compares the current authority with the last message sent to the page. Used on the event loop.
 
-    ``gone_s``: the page's control expires after the cockpit has been silent for this long [s].
+    ``gone_s``: the page's control expires once the cockpit has received nothing from the page for this long [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:
@@ -204,10 +202,7 @@ class AuthorityReport:
         self._given, self._given_ns = given, monotonic_ns()
 
     def update(self, pilot: PilotConnection | None, place: QueuePosition | None) -> Json | None:
-        """Return the message for the page, or None if nothing has changed.
-
-        ``pilot``: the page's own connection, if any. ``place``: the page's position in the queue while it waits.
-        """
+        """Return the message for the page, or None if unchanged. ``place``: its position in the queue, if any."""
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
         next_owner: str | None = None  # name of the first application in the queue, which may be a program
@@ -253,7 +248,7 @@ class AuthorityReport:
         }
 
     def outranks(self, priority: int) -> bool:
-        """Return whether a priority is known to be higher than that of the holder."""
+        """Return whether a priority is higher than the holder's, or the holder's is unknown."""
         try:
             held = self._station.feedback().owner_priority
         except LinkError:
@@ -261,7 +256,7 @@ class AuthorityReport:
         return held is None or priority < held
 
     def busy(self, priority: int) -> str:
-        """Return text that explains why a given priority can't take control."""
+        """Explain why an application with this priority can't take control."""
         try:
             feedback = self._station.feedback()
         except LinkError:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from skyloop.vision import Detection
 
 KEPT_S: Final = 3.0  #: a box drawn on a picture older than this is refused and must be drawn again
-KEPT_BYTES: Final = 64 * 1024 * 1024
+KEPT_BYTES: Final = 64 * 1024 * 1024  #: maximum total size of the kept frames
 #: While catching up, a tracker uses the newest frame that is at most this much later than the previous one.
 STRIDE_S: Final = 0.07
 
@@ -43,10 +43,9 @@ SOURCE: Final = "follow"  #: source name of the drawings
 
 
 class KeptFrames:
-    """Frames as JPEGs, ordered by capture time: only the newest :data:`KEPT_S` or :data:`KEPT_BYTES` are kept."""
+    """Frames as JPEGs, ordered by capture time: only the newest :data:`KEPT_S` or ``most_bytes`` are kept."""
 
     def __init__(self, most_bytes: int = KEPT_BYTES) -> None:
-        """Initialise without frames; at most ``most_bytes`` of them are kept."""
         self.bytes = 0  #: total size of the kept frames
         self._most_bytes = most_bytes
         self._frames: deque[Arrival] = deque()
@@ -55,7 +54,7 @@ class KeptFrames:
         return len(self._frames)
 
     def add(self, arrival: Arrival) -> None:
-        """Add a frame. If the newest one was captured later (the proxy restarted), discard the frames kept so far."""
+        """Add a frame. If it is no newer than the last one (the proxy restarted), discard the frames kept so far."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
         self._frames.append(arrival)
@@ -71,10 +70,7 @@ class KeptFrames:
         self.bytes = 0
 
     def find(self, captured_ns: int) -> Arrival:
-        """Return the frame with this capture time.
-
-        Raise ``RefusedError`` if the frame was not kept; the message says why.
-        """
+        """Return the frame with this capture time; raise ``RefusedError``, which says why, if it was not kept."""
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
                 return arrival
@@ -127,7 +123,7 @@ class FrameKeeper:
         self._newest: Frame | None = None
         self._samples: deque[Feedback] = deque(maxlen=_SAMPLES)
         self._results: deque[Result] = deque(maxlen=_RESULTS)
-        self._news = threading.Condition()  # guards the fields above this one
+        self._news = threading.Condition()  # guards the private fields
         self._closed = False
         self._listeners: list[Listener[Any]] = [
             drone.on_feedback(self._on_feedback, inline=True),
@@ -150,7 +146,7 @@ class FrameKeeper:
         with self._news:
             self._kept.clear()
             self._news.wait_for(lambda: self._closed or self._is_news(captured_ns), timeout_s)
-            frame, self._newest = self._newest, None  # keep no reference, as the frame's memory belongs to the proxy
+            frame, self._newest = self._newest, None  # a reference to the frame would occupy the proxy's memory
             return frame if frame is not None and frame.captured_ns != captured_ns else None
 
     def feedback(self, until_ns: int | None) -> list[Feedback]:
@@ -291,7 +287,6 @@ class TargetTracker:
         self._keeper.close()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the started thread has ended."""
         self._thread.join(timeout_s)
 
     # On the thread ---------------------------------------------------------------------------------------------
@@ -313,7 +308,7 @@ class TargetTracker:
             self._keeper.close()
 
     def _catch_up(self, follower: Follower) -> None:
-        """Track from the box's frame through the kept frames for at most :data:`KEPT_S`, then in the newest frames."""
+        """Track from the box's frame through the kept frames, for at most :data:`KEPT_S`."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
         arrival: Arrival | None
         arrival, self._begin = self._begin, None

@@ -141,10 +141,7 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 
 
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
-    """Convert a motion capture pose to JSON values.
-
-    ``pose``: position [m] and quaternion x, y, z, w, or None if unknown.
-    """
+    """Convert a motion-capture pose, position [m] and quaternion x, y, z, w, to JSON values."""
     if pose is None:
         return None
     x, y, z, w = pose[3:7]
@@ -242,12 +239,11 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """Return the newest values of everything that changes, as a JSON object that lacks its final brace."""
+        """Return all values that change, as a JSON object without its final brace: each page's events are appended."""
         self._refresh_channels()
         return encode_json(self._values(self._clock()))[:-1]
 
     def overview(self) -> Json:
-        """Return the drone's row in the overview."""
         feedback = self._feedback()
         vehicle = self.vehicle()
         motion = motion_values(feedback)
@@ -268,7 +264,6 @@ class TelemetryView:
         return [event_values(number_, event, now_ns) for number_, event in events]
 
     def alarms(self, feedback: Feedback | None) -> list[Alarm]:
-        """Return the current alarms, the most severe first."""
         drone = self._station.drone
         # Feedback that is old only because it is sent less often is no cause for an alarm.
         age_s = None if feedback is None else self._age_s(feedback.captured_ns) - self._station.feedback_period_s
@@ -283,11 +278,7 @@ class TelemetryView:
         return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 
     def holder(self, feedback: Feedback | None) -> str | None:
-        """Return the name of the application that holds authority.
-
-        None if no lease is in force (even if feedback still contains the name of its last holder) or the proxy can't be
-        reached.
-        """
+        """Return the application that holds authority; None without a lease (feedback may still name one) or a link."""
         broken = self._links()["application"] in _BROKEN
         return None if feedback is None or broken or not feedback.lease else feedback.owner
 

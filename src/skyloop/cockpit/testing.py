@@ -29,7 +29,7 @@ from skyloop.clock import monotonic_ns, seconds
 from skyloop.errors import LinkError
 
 _LENGTH: Final = struct.Struct(">I")
-STARTS_WITHIN_S: Final = 10.0
+STARTS_WITHIN_S: Final = 10.0  #: time limit for the first state of every page
 
 
 class HeadlessPage:
@@ -80,11 +80,7 @@ class HeadlessPage:
         )
 
     async def run(self) -> None:
-        """Watch until cancelled.
-
-        Raises:
-            LinkError: The cockpit closed the connection or refused the page.
-        """
+        """Watch until cancelled; raise ``LinkError`` if the cockpit closed the connection or refused the page."""
         base = f"/ws/drones/{self.drone}"
         try:
             async with self.open(f"{base}/telemetry") as socket:
@@ -150,11 +146,10 @@ class Pages:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
         self._changed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="pages", daemon=True)
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="pages", daemon=True)
 
     @property
     def frames(self) -> int:
-        """Total number of frames on all pages."""
         return sum(client.frames for client in self.clients)
 
     @property
@@ -165,11 +160,6 @@ class Pages:
         return max(known) if known and len(known) == len(ages) else None
 
     def __enter__(self) -> Self:
-        """Open the pages and wait until each of them has received its first state.
-
-        Raises:
-            LinkError: Opening the pages takes longer than :data:`STARTS_WITHIN_S`.
-        """
         self._thread.start()
         self._changed.wait(STARTS_WITHIN_S)
         if self.problem is not None or not all(client.states for client in self.clients):
@@ -187,10 +177,7 @@ class Pages:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _run(self) -> None:
-        asyncio.run(self._main())
-
-    async def _main(self) -> None:
+    async def _run(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         pages = [asyncio.create_task(client.run()) for client in self.clients]
         stopping = asyncio.create_task(self._stop.wait())

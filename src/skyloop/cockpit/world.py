@@ -31,17 +31,13 @@ if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.messages import CameraInfo, Feedback, Value
-    from skyloop.messages.parameter import WorldGeometry
 
 LIMITS: Final = ("speed", "climb", "altitude")
 RECORDED: Final = "recorded."  #: prefix of recorded parameters, see docs/replay.md
 
 
 def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
-    """Return a drone's surroundings for maps. This function queries the drone's proxy and waits for the answers.
-
-    ``given``: the scenery to use if the drone does not report any.
-    """
+    """Query a drone's surroundings from its proxy, and wait. ``given``: the scenery if the drone reports none."""
     read = _reader(drone)
     known = _known(read(WORLD))
     world = known or given
@@ -57,10 +53,7 @@ def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
 
 
 def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
-    """Return the proxy's objections to a straight flight from the drone's position to a place.
-
-    ``place``: the place, in world axes [m].
-    """
+    """Return the proxy's objections to a straight flight from the drone's position to a place, in world axes [m]."""
     read = _reader(drone)
 
     def limit(name: str) -> float:
@@ -172,10 +165,7 @@ MAX_ASKING: Final = 4  #: maximum number of parallel requests to drones; each ma
 
 
 class WorldApi:
-    """The routes ``world``, ``way`` and ``preflight`` for each drone.
-
-    ``given``: the surroundings used for drones that report none.
-    """
+    """The routes ``world``, ``way`` and ``preflight`` of each drone. ``given``: the scenery if a drone reports none."""
 
     def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
         self._fleet = fleet
@@ -192,7 +182,6 @@ class WorldApi:
 
     @answered
     async def world(self, request: Request) -> Response:
-        """Respond with a drone's surroundings for maps."""
         return await self._ask(request, lambda drone: world_values(drone, self._given))
 
     @answered
@@ -203,7 +192,6 @@ class WorldApi:
 
     @answered
     async def preflight(self, request: Request) -> Response:
-        """Respond with the preflight checklist."""
         folder = self._recordings.folder
         station = self._fleet.stations.get(request.path_params["name"])
         ours = station is not None and bool(station.view.overview()["me"])
@@ -215,7 +203,7 @@ class WorldApi:
         return await self._ask(request, check)
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
-        """Query a drone on a thread, because its response may take a while."""
+        """Query a drone on a thread, because its proxy may take a while to answer."""
         drone = self._fleet.station(request.path_params["name"]).drone
         async with self._asking:
             return answer_json(await asyncio.to_thread(question, drone))

@@ -36,7 +36,7 @@ def test_a_page_flying_to_a_place_yields_to_a_mode_change(kind: Kind, tmp_path: 
     """The page's own hover put it back into GUIDED 0.6 s later, and so did closing the page."""
     with Scene(kind, tmp_path / "alpha.flight") as scene:
         proxy = scene.proxy()
-        with taken_off(scene), cockpit(Fleet(Finder(scene), look_s=0.05)) as client:
+        with taken_off(scene), cockpit(Fleet(Finder(scene), search_s=0.05)) as client:
             with page(client) as pilot, pilot.staying():
                 pilot.take(4)
                 pilot.say("goto", x=80, y=0, z=6)

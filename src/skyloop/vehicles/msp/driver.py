@@ -39,7 +39,6 @@ class MspDriver(Driver):
         self._link: MspLink | None = None
 
     def capabilities(self) -> Capabilities:
-        """Return the driver's capabilities."""
         return Capabilities(vehicle="msp", actions=ACTIONS, description=f"a flight controller on {self.options}")
 
     def _open(self, sink: Sink) -> None:
@@ -48,15 +47,12 @@ class MspDriver(Driver):
                 import serial  # noqa: F401  fails now if it is missing; the link's thread imports it to open the port
             except ImportError as error:
                 raise MissingExtraError(f"{self.uri}", EXTRA, cause=str(error)) from error
-        known = SetpointController(self.options.override)  # used only to keep settings and learnt values
-        known.limits, known.gains, known.given_aux = (
-            self._setpoints.limits,
-            self._setpoints.gains,
-            self._setpoints.given_aux,
-        )
-        known.hover, known.full_tilt_rad = self._setpoints.hover, self._setpoints.full_tilt_rad
-        self._setpoints = known
-        session = MspSession(self.options, monotonic_ns(), known)
+        # A fresh controller, which keeps only the settings and learnt values of the previous one.
+        before, fresh = self._setpoints, SetpointController(self.options.override)
+        fresh.limits, fresh.gains, fresh.given_aux = before.limits, before.gains, before.given_aux
+        fresh.hover, fresh.full_tilt_rad = before.hover, before.full_tilt_rad
+        self._setpoints = fresh
+        session = MspSession(self.options, monotonic_ns(), fresh)
         self._link = MspLink(session, partial(deliver, sink))
         self._link.start()
 
@@ -104,7 +100,6 @@ class MspDriver(Driver):
             return DriverParameters(self._setpoints).parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Write a parameter."""
         link = self._link
         if link is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)

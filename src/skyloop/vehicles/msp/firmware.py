@@ -41,7 +41,7 @@ _PROCEDURES: Final = {
     BETAFLIGHT: ("it lands with failsafe_throttle", "it drops", "it returns by GPS rescue"),
     INAV: ("it lands", "it drops", "it returns home", "it does nothing"),
 }
-_NOTHING: Final = 3
+_NOTHING: Final = 3  # INAV's procedure that does nothing
 _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 
@@ -56,7 +56,7 @@ class Setup:
     sticks_known: bool = False  #: whether those positions were reported rather than assumed
     rx: msp.RxConfig = field(default_factory=msp.RxConfig)
     failsafe: msp.FailsafeConfig | None = None
-    on_loss: tuple[tuple[int, int], ...] = ()
+    on_loss: tuple[tuple[int, int], ...] = ()  #: each channel's :class:`OnLoss` value and pulse width [µs]
     features: int | None = None
     rates: Rates | None = None
     inav_yaw_rate_deg_s: float | None = None
@@ -253,7 +253,7 @@ def hindrances(diagnostics: list[Diagnostic]) -> str:
     return "; ".join(f"{each.detail} ({each.advice})" if each.advice else each.detail for each in bad)
 
 
-_INAV_TUNING: Final = 7  # number of bytes in RC_TUNING up to the yaw rate
+_INAV_TUNING: Final = 11  # number of bytes in INAV's RC_TUNING up to the expo for yaw
 _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
@@ -332,7 +332,7 @@ def _box_names(setup: Setup, payload: bytes) -> dict[str, Any]:
 def _tuning(setup: Setup, payload: bytes) -> dict[str, Any]:
     if setup.identity.variant == BETAFLIGHT:
         return {"rates": betaflight_rates(payload)}
-    if len(payload) < _INAV_TUNING + 4:
+    if len(payload) < _INAV_TUNING:
         return {}
     # INAV: rate, expo for roll and pitch, rates of roll, pitch and yaw in 10 degrees/s, …, expo for yaw
     return {"inav_yaw_rate_deg_s": payload[4] * 10.0, "inav_expo": (payload[1], payload[10])}

@@ -17,8 +17,8 @@ from skyloop.messages import Parameter, ParameterType, Value
 from skyloop.vehicles.msp.firmware import MOST_AUX
 from skyloop.vehicles.msp.setpoints import Gains, Limits, SetpointController
 
-DEFAULT_BAUD: Final = 115_200
-DEFAULT_RATE_HZ: Final = 50.0
+DEFAULT_BAUD: Final = 115_200  #: the firmwares' own default for MSP
+DEFAULT_RATE_HZ: Final = 50.0  #: default rate of stick frames
 KNOWN: Final = {"baud", "rate", "override"}
 _EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200 or msp://tcp:127.0.0.1:5761"
 
@@ -35,7 +35,6 @@ class MspOptions:
 
     @property
     def serial(self) -> bool:
-        """Whether the address is a serial port."""
         return self.port is None
 
     def __str__(self) -> str:
@@ -43,7 +42,6 @@ class MspOptions:
 
 
 def options_of(uri: VehicleUri) -> MspOptions:
-    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     rate = uri.number("rate", DEFAULT_RATE_HZ, minimum=20.0, maximum=250.0)
     override = uri.flag("override", default=False)
@@ -80,10 +78,7 @@ _LEARNT: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    parameter: Parameter
-    write: Callable[[float], None]
+_Entry = tuple[Parameter, Callable[[float], None]]  # a parameter with its current value, and what writes it
 
 
 class DriverParameters:
@@ -94,16 +89,17 @@ class DriverParameters:
 
     def parameters(self) -> list[Parameter]:
         """Return all parameters with their current values."""
-        return [entry.parameter for entry in self._entries().values()]
+        return [parameter for parameter, _ in self._entries().values()]
 
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force; raise an error for an unknown name or an invalid value."""
         entries = self._entries()
         if name not in entries:
             raise UnknownNameError("parameter of msp://", name, entries)
-        value = checked_value(entries[name].parameter, value)
+        parameter, write = entries[name]
+        value = checked_value(parameter, value)
         assert isinstance(value, int | float)
-        entries[name].write(value)
+        write(value)
         return value
 
     def _entries(self) -> dict[str, _Entry]:
@@ -114,13 +110,13 @@ class DriverParameters:
         ]
         for name, field, high, unit, text in _LEARNT:
             parameter = _number(name, getattr(setpoints, field) or 0.0, 0.0, high, unit, text, 0.0)
-            made.append(_Entry(parameter, partial(self._write_learnt, field)))
+            made.append((parameter, partial(self._write_learnt, field)))
         for channel in range(MOST_AUX):
             name, value = f"{AUX}{channel + 1}", setpoints.given_aux.get(channel, AUTOMATIC)
             text = "pulse width sent on this AUX channel; 0: as arming and ANGLE mode need it; not for the arm switch"
             parameter = Parameter(name, ParameterType.INT, value, "µs", 0, 2100, default=AUTOMATIC, description=text)
-            made.append(_Entry(parameter, partial(self._write_aux, channel)))
-        return {entry.parameter.name: entry for entry in made}
+            made.append((parameter, partial(self._write_aux, channel)))
+        return {entry[0].name: entry for entry in made}
 
     def _setting(
         self, group: str, name: str, usual: Limits | Gains, field: str, low: float, high: float, unit: str, text: str
@@ -131,7 +127,7 @@ class DriverParameters:
             setattr(self._setpoints, group, replace(getattr(self._setpoints, group), **{field: value}))
 
         now = getattr(getattr(self._setpoints, group), field)
-        return _Entry(_number(name, now, low, high, unit, text, getattr(usual, field)), write)
+        return _number(name, now, low, high, unit, text, getattr(usual, field)), write
 
     def _write_learnt(self, field: str, value: float) -> None:
         setattr(self._setpoints, field, value or None)

@@ -38,13 +38,15 @@ MOST_STICKS: Final = 4  #: maximum number of unacknowledged stick frames
 STICKS_LOST_NS: Final = nanoseconds(0.1)  #: an older unacknowledged frame is lost if a newer reply has arrived
 LAST_STICKS: Final = 3  #: number of final stick frames, level or disarming, sent to a silent flight controller
 COUNT_NS: Final = nanoseconds(1.0)  #: period over which acknowledged sticks are counted
-UNTOLD_NS: Final = nanoseconds(0.5)  #: time without sticks after which it arms only once the arm switch has been off
+#: Time without sticks after which a flight controller arms only once its arm switch has been off.
+UNTOLD_NS: Final = nanoseconds(0.5)
 LEAST_STICKS_HZ: Final = 25.0  #: rate below which a warning is given
 BUNDLING_API: Final = (1, 42)  #: Betaflight's API version that introduced MULTIPLE
 _MODES_AT: Final = 6  # offset of the modes in STATUS
-WAKING_NS: Final = nanoseconds(8.0)  #: longest time after power-on in which temporary conditions prevent arming
+WAKING_NS: Final = nanoseconds(8.0)  #: longest time after being found for which a flight controller is starting up
 AGAIN_NS: Final = nanoseconds(1.0)  #: time between attempts to identify the flight controller
 
+# Rates at which states are requested. Replies limit them: see :class:`Telemetry`.
 ATTITUDE_HZ: Final = 50.0
 ALTITUDE_HZ: Final = 25.0
 STATUS_HZ: Final = 20.0
@@ -123,7 +125,6 @@ class MspSession(VehicleSession):
         return self._stick_frame(now_ns)
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return diagnostics about the flight controller's settings and state."""
         if self.setup is None:
             unread = "the flight controller's settings have not been read"
             return [Diagnostic("settings", False, unread, "wait until its link is up, then check again", severe=True)]
@@ -450,7 +451,7 @@ class MspSession(VehicleSession):
     # Loss ----------------------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """Identify the flight controller again while polling its state, so control of a flying vehicle soon resumes.
+        """Identify the flight controller again while requesting its state, so that control in flight soon resumes.
 
         After :data:`LAST_STICKS` final frames, only requests and stops are sent, so that the vehicle's failsafe acts.
         """

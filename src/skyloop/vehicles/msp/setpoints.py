@@ -23,7 +23,7 @@ from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, st
 
 GRAVITY_M_S2: Final = 9.80665
 LEVEL: Final = Attitude()
-OFF_US: Final = 1000
+OFF_US: Final = 1000  #: pulse width of a throttle that is off
 SPOOL_PER_S: Final = 0.15  #: rate at which the throttle rises during take-off, fraction of full throttle per second
 SPOOL_FROM: Final = 0.6  #: fraction of the hover throttle, if known, at which the rise begins
 IDLE: Final = 0.05  #: throttle at which the rise begins if the hover throttle is unknown
@@ -61,11 +61,11 @@ SINK_PER_S: Final = 0.5  #: throttle reduction while the vehicle seems to be on 
 #: more than HIGH_M above the ground it left. A vehicle that is still airborne falls at the lower throttle, fast enough
 #: to be noticed even if its motion is underestimated, as in a simulated world that lags behind the firmware's clock.
 OFF_BELOW: Final = {False: 0.6, True: 0.15}
-HIGH_M: Final = 0.5
+HIGH_M: Final = 0.5  #: see :data:`OFF_BELOW`
 BLIND: Final = 0.93  #: fraction of the hover throttle used while the climb rate is unknown; the vehicle sinks
 BLIND_NS: Final = nanoseconds(6.0)  #: time with an unknown climb rate after which the vehicle is disarmed
 MOST_LEARNT: Final = 0.9  #: upper limit of the learnt hover throttle
-LEAST_LEARNT: Final = 0.05
+LEAST_LEARNT: Final = 0.05  #: lower limit of the learnt hover throttle
 LIFT_M_S2: Final = 4.0  #: limit of the climb loop's output
 #: Reason given for not restarting a vehicle that did not confirm a stop.
 UNSHOWN: Final = "the motors were stopped, and it is still armed: it can fly again once it reports that it is disarmed"
@@ -73,8 +73,6 @@ UNSHOWN: Final = "the motors were stopped, and it is still armed: it can fly aga
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits for set-points."""
-
     tilt: float = 0.35  #: [rad]
     climb: float = 1.0  #: [m/s]
     yaw_rate: float = 1.75  #: [rad/s]
@@ -90,8 +88,6 @@ class Gains:
 
 
 class Phase(Enum):
-    """Phases of a flight."""
-
     STANDING = auto()  #: on the ground, or being flown by a pilot
     ARMING = auto()
     SPOOLING = auto()  #: armed, with the throttle rising
@@ -133,16 +129,16 @@ class SetpointController:
         self._wanted = LEVEL
         self._motion = Motion()
         self._since_ns = 0  # start of the phase
-        self._stepped_ns: int | None = None
+        self._stepped_ns: int | None = None  # when the channels were last computed
         self._switched = False  # whether the arm switch is on, while arming
-        self._named: tuple[list[str], int] | None = None
-        self._refused: tuple[str, int] | None = None
-        self._abort_ns: int | None = None
-        self._still_ns: int | None = None
+        self._named: tuple[list[str], int] | None = None  # obstacles to arming, and since when they are reported
+        self._refused: tuple[str, int] | None = None  # why the last take-off failed, and when
+        self._abort_ns: int | None = None  # since when the climb of a take-off is interrupted
+        self._still_ns: int | None = None  # since when a descent is stalled
         self._smooth_climb = self._smooth_wanted = 0.0  # measured and requested climb, filtered with the same delay
         self._smooth_height = 0.0
-        self._blind_ns: int | None = None
-        self._sink = 1.0
+        self._blind_ns: int | None = None  # since when the climb rate is unknown
+        self._sink = 1.0  # factor on the throttle, reduced while the vehicle seems to be on the ground
         self._asked_ns: int | None = None  # when the pending take-off was requested
         self._events: list[VehicleEvent] = []
 
@@ -212,7 +208,7 @@ class SetpointController:
         return self._wanted
 
     def why_not(self, now_ns: int) -> str:
-        """Return why it can't take off now; empty if no reason is known, or if a take-off is already in progress."""
+        """Return why the vehicle can't take off now; empty if no reason is known, or a take-off has already begun."""
         if self.phase is not Phase.STANDING:
             return ""
         if self.stop.active:
@@ -265,7 +261,6 @@ class SetpointController:
     # Reports -------------------------------------------------------------------------------------------------------
 
     def on_report(self, report: Report, now_ns: int) -> None:
-        """Handle the flight controller's latest report."""
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         self._cut = self._cut and report.armed is not False
@@ -305,7 +300,6 @@ class SetpointController:
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
 
     def on_motion(self, motion: Motion) -> None:
-        """Handle a new motion estimate."""
         self._motion = motion
 
     def lost(self) -> None:

@@ -36,14 +36,6 @@ TRIES: Final = 3  #: maximum number of attempts per request
 Handler = Callable[[bytes | None], None]
 
 
-@dataclass(slots=True)
-class Asked:
-    """A pending request."""
-
-    function: int
-    sent_ns: int
-
-
 class Questions:
     """Asks one question at a time, and repeats it until it is answered, at most :data:`TRIES` times in total."""
 
@@ -120,7 +112,7 @@ class Telemetry:
         self._streams = [Stream(functions, nanoseconds(1 / rate)) for functions, rate in rates.items()]
         self._bundle = bundle
         self._most = most
-        self._asked: deque[Asked] = deque()
+        self._asked: deque[tuple[int, int]] = deque()  # function and sending time of each pending request
         self.unanswered = 0
 
     def drop(self, function: int) -> None:
@@ -137,7 +129,7 @@ class Telemetry:
 
     def requests(self, now_ns: int) -> list[Frame]:
         """Return the requests to send now, the most overdue first."""
-        while self._asked and now_ns - self._asked[0].sent_ns >= PATIENCE_NS:
+        while self._asked and now_ns - self._asked[0][1] >= PATIENCE_NS:
             self._asked.popleft()
             self.unanswered += 1
         made: list[Frame] = []
@@ -146,14 +138,14 @@ class Telemetry:
                 break
             stream.due_ns = max(stream.due_ns + stream.period_ns, now_ns)
             frame = stream.frame
-            self._asked.append(Asked(frame.function, now_ns))
+            self._asked.append((frame.function, now_ns))
             made.append(frame)
         return made
 
     def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
         """Handle a frame; return the states that it contains, using None for any that the firmware does not support."""
-        for number, asked in enumerate(self._asked):
-            if frame.function != asked.function:
+        for number, (function, _) in enumerate(self._asked):
+            if frame.function != function:
                 continue
             for _ in range(number + 1):
                 self._asked.popleft()
@@ -173,7 +165,7 @@ GAP_NS: Final = nanoseconds(0.4)  #: gap between poses above which the velocity 
 SMOOTH_S: Final = 0.05  #: time constant of the velocity computed from poses
 LEAST_SATELLITES: Final = 5  #: fixes with fewer satellites than this are ignored
 GROUND_SAMPLES: Final = 10  #: approximate number of samples over which the ground's height is averaged
-EARTH_RADIUS_M: Final = 6_371_000.0
+EARTH_RADIUS_M: Final = 6_371_000.0  #: mean radius, for a flat map around the first fix
 
 
 class VelocityFilter:
@@ -275,7 +267,6 @@ class MotionEstimate:
         self._ground[source] = before_m + (height_m - before_m) / self._stood
 
     def at(self, now_ns: int) -> Motion:
-        """Return the present motion."""
         yaw = self._heading_rad
         if yaw is not None and self._turned_rad is not None:
             yaw = wrap_angle(yaw + self._turned_rad)
@@ -333,7 +324,6 @@ class Reported:
     altitude: Altitude | None = None
     status: Status | None = None
     battery: Battery | None = None
-    satellites: int | None = None
     cells: CellVoltages = field(default_factory=CellVoltages)
 
 

@@ -64,7 +64,7 @@ PURPOSE: Final = "a robot of ROS 2"
 class RobotLink:
     """A node that subscribes to a robot's topics and publishes ``cmd_vel`` for it.
 
-    The driver subscribes to images only while an application wants them, or if no other topic indicates a robot.
+    It subscribes to images only while an application wants them, or always if the address names no odometry.
     """
 
     def __init__(self, options: Options, sink: Sink) -> None:

@@ -78,8 +78,8 @@ def require_rclpy(purpose: str, *packages: str) -> Any:
 def stay_on_this_machine(environment: MutableMapping[str, str] = os.environ) -> bool:
     """Make this process's nodes visible only on this machine, unless the environment configures discovery.
 
-    Call this before creating the first node. Returns whether the environment was changed. The profile is a file in a
-    temporary directory that is removed at exit.
+    Call this before creating the first node. Returns whether the environment was changed, by this call or, for Fast
+    DDS, by an earlier one. Fast DDS reads a profile from a temporary directory that is removed at exit.
     """
     if any(environment.get(variable) for variable in DISCOVERY_VARIABLES):
         return bool(_profile) and _profile["path"] in map(environment.get, DISCOVERY_VARIABLES[:2])

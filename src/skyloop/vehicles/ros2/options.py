@@ -1,4 +1,4 @@
-"""Parsing and checking of the options in ``ros2://`` addresses. Pure."""
+"""Options in a ``ros2://`` address, listed in ``docs/ros.md``. Pure."""
 
 from __future__ import annotations
 
@@ -63,7 +63,6 @@ class Options:
     domain: int | None  #: DDS domain; None to use ``ROS_DOMAIN_ID``
 
     def capabilities(self) -> Capabilities:
-        """Return the capabilities provided by the robot's topics and services."""
         actions: set[str] = set()
         if self.cmd_vel:
             actions = {"idle", "velocity"}
@@ -88,7 +87,6 @@ class Options:
 
 
 def options_of(uri: VehicleUri) -> Options:
-    """Return the options in an address."""
     reject_unknown_options(uri, KNOWN)
     namespace = f"/{uri.place.strip('/')}" if uri.place.strip("/") else ""
     if namespace and not _NAME.match(namespace):

@@ -1,6 +1,6 @@
 """A robot as a vehicle: messages become samples for the proxy's sink, actions become velocities and service calls.
 
-This module does not need rclpy: any object with the right fields is a message, and a function calls services.
+This module does not need rclpy: any object with the right fields is a message, and commands go through :class:`Robot`.
 """
 
 from __future__ import annotations
@@ -36,8 +36,7 @@ PERIOD_S: Final = 0.05  #: time between repeats of a velocity, because robots st
 AIRBORNE_M: Final = 0.1  #: height in the odometry above which a robot counts as flying
 SERVICES_S: Final = 5.0  #: time allowed for discovering the robot's services
 ANSWER_S: Final = 30.0  #: time allowed for a service's response
-BLIND_NS: Final = nanoseconds(0.2)  #: how long a velocity is repeated if odometry stops arriving
-_FEEDBACK_NS: Final = nanoseconds(PERIOD_S)
+BLIND_NS: Final = nanoseconds(0.2)  #: while odometry is missing, older velocities are replaced by a stop
 
 
 class Robot(Protocol):
@@ -86,7 +85,7 @@ class RobotSession:
         self._received_ns: int | None = None
         self._odometry_ns: int | None = None
         self._measures_height = False  # whether odometry has ever been above the ground, which planar odometry never is
-        self._fed_ns = 0
+        self._fed_ns = 0  # when feedback was last published
         self._opened_ns = clock()
         self._link: LinkState | None = None
         self._velocity: Velocity | None = None  # velocity in force
@@ -191,7 +190,7 @@ class RobotSession:
             return
         if blind and self._odometry_ns is not None:
             self._lose(LinkState.DEGRADED, seconds(now_ns - self._odometry_ns), self._options.odom)
-        if not self._fields and self._received_ns is not None and now_ns - self._fed_ns > 2 * _FEEDBACK_NS:
+        if not self._fields and self._received_ns is not None and now_ns - self._fed_ns > nanoseconds(2 * PERIOD_S):
             self._publish(self._received_ns, now_ns)  # without odometry, images at least show that the robot is present
 
     def close(self) -> None:
@@ -211,8 +210,8 @@ class RobotSession:
         if self._pending is not None:
             return self._pending.state
         altitude_m = self._fields.get("altitude_m")
-        told = self._up is not None and not self._measures_height  # rely on the services if odometry may be planar
-        up = self._up if self._options.ground or altitude_m is None or told else altitude_m > AIRBORNE_M
+        by_services = self._up is not None and not self._measures_height  # odometry may be planar
+        up = self._up if self._options.ground or altitude_m is None or by_services else altitude_m > AIRBORNE_M
         if up is None:
             return FlightState.UNKNOWN
         if not up:
@@ -309,7 +308,7 @@ class RobotSession:
         self._sink.feedback(feedback)
 
     def _warn_once(self, text: str) -> None:
-        """Emit a warning, but only once for each text."""
+        """Emit a warning once for each text, and for at most eight texts."""
         if text not in self._warned and len(self._warned) < 8:
             self._warned.add(text)
             self._sink.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="image")

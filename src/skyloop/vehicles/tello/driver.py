@@ -35,7 +35,7 @@ class TelloDriver(Driver):
         self._link: TelloLink | None = None
         self._settings: DroneSettings | None = None
         self._video: LiveVideo | None = None
-        self._video_ns = 0  # when the last image arrived
+        self._video_ns = 0  # when usable video last arrived; 0 if never
 
     def capabilities(self) -> Capabilities:
         """Return the drone's capabilities.

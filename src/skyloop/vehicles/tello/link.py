@@ -16,7 +16,7 @@ from skyloop.messages import AnyAction
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.protocol import TelloSession
 
-_BUFFER: Final = 1 << 20  # buffer size, enough for half a second of video
+_BUFFER: Final = 1 << 20  # requested size of receive buffers [bytes]; enough for half a second of video
 
 
 def command_socket(options: TelloOptions, address: str) -> socket.socket:
@@ -62,7 +62,7 @@ def _through(options: TelloOptions) -> socket.socket:
     return made
 
 
-ASK_S: Final = 0.95  #: time within which a command must get a reply
+ASK_S: Final = 0.95  #: time limit for the reply to a command; the session gives up after three tries of 0.3 s
 
 
 class TelloLink(VehicleLink[TelloSession]):

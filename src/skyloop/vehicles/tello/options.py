@@ -54,7 +54,6 @@ class TelloOptions:
 
 
 def options_of(uri: VehicleUri) -> TelloOptions:
-    """Parse an address."""
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host; it should look like tello://192.168.10.1")

@@ -22,7 +22,7 @@ NO_FLIP: Final = "none"
 FLIPS: Final = {"left": "l", "right": "r", "forward": "f", "back": "b"}
 FLIP: Final = "tello.flip"
 CAMERA: Final = "camera.active"
-_GREATEST: Final = 10.0
+_GREATEST: Final = 10.0  # upper bound of speeds [m/s] and of the yaw rate [rad/s], beyond what a Tello can do
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +76,14 @@ SETTINGS: Final = {
             V3,
             {"high": "setresolution high", "low": "setresolution low"},
             "high",
-            "of the front camera (setresolution)",
+            "resolution of the front camera (setresolution)",
         ),
         _choice(
             "camera.bitrate",
             V3,
             {rate: f"setbitrate {rate}" for rate in range(6)},
             0,
-            "of the video; 0: as the drone sees fit (setbitrate)",
+            "bitrate of the video; 0: chosen by the drone (setbitrate)",
             "Mbit/s",
         ),
     )
@@ -100,7 +100,7 @@ FULL: Final = "tello.full_stick."
 
 
 def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
-    """Return the parameters for the largest set-points and for the effect of a full stick."""
+    """Return the parameters for the limits of set-points and for the effect of a full stick."""
     usual = Scale()
     made = []
     for field, unit, (low, high), text in _SCALES:
@@ -129,8 +129,8 @@ def flip_parameter(value: str) -> Parameter:
 def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
     """Return the properties that the drone reports, as read-only parameters."""
     known = (
-        ("tello.sdk", "" if sdk is None else sdk.value, "of the firmware"),
-        ("tello.serial", serial, "the drone's number (sn?)"),
+        ("tello.sdk", "" if sdk is None else sdk.value, "the firmware's SDK version"),
+        ("tello.serial", serial, "the drone's serial number (sn?)"),
     )
     kind = ParameterType.TEXT
     return [Parameter(name, kind, text, read_only=True, description=what) for name, text, what in known if text]

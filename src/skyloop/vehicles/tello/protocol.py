@@ -22,8 +22,8 @@ from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severit
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import TelloOptions
 from skyloop.vehicles.tello.setpoints import SetpointController
-from skyloop.vehicles.tello.telemetry import Health, feedback_of, native_of
-from skyloop.vehicles.tello.wire import ENTER, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
+from skyloop.vehicles.tello.telemetry import Health, feedback_of
+from skyloop.vehicles.tello.wire import ENTER, HOST, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: time allowed for a reply; real drones take at most 29 ms over a good link
 TRIES: Final = 3  #: number of times a request is sent before it fails
@@ -38,8 +38,8 @@ class Request:
     """A command to which a reply is expected."""
 
     text: str
-    done: Done  #: called with the reply, or None if there was none
-    tries: int = TRIES  #: maximum number of times to send the command
+    done: Done
+    tries: int = TRIES  #: number of tries left, including the current one
     sent_ns: int | None = None  #: when the command was last sent
 
 
@@ -56,7 +56,7 @@ class Conversation:
         self.counts = Counter(dict.fromkeys(("answered", "unanswered", "stray"), 0))
         self._queue: deque[Request] = deque()
         self._asked: Request | None = None
-        self._motions: dict[str, int] = {}  # when each motion was last sent
+        self._motions: dict[str, int] = {}  # when each motion that awaits its reply was last sent
 
     @property
     def idle(self) -> bool:
@@ -133,9 +133,8 @@ ALONE_NS: Final = nanoseconds(30.0)  #: time within which a drone without comman
 ASK_NS: Final = nanoseconds(5.0)  #: time allowed for asking a drone flown by another program for its version
 DEAF: Final = 2  #: this many consecutive unanswered requests mean that our commands are not received
 VIDEO_NS: Final = nanoseconds(2.0)  #: time without usable video after which video is requested
-ALIVE: Final = "wifi?"
-DEFAULT_HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
-_TELLOS_NETWORK: Final = "192.168.10."
+ALIVE: Final = "wifi?"  #: the periodic request, which every SDK version has
+_TELLOS_NETWORK: Final = HOST.removesuffix("1")
 
 _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 
@@ -172,11 +171,11 @@ class TelloSession(VehicleSession):
         self._health = Health()
         self._entered_ns = now_ns - ENTER_NS
         self._lost_ns = self._sent_ns = now_ns  # time of the link loss or of a later hover request; last datagram
-        self._alive_ns = self._found_ns = now_ns
+        self._alive_ns = self._found_ns = now_ns  # time of the last periodic request; of the first state
         self._asked_video_ns = 0
         self._asking_version = False
-        self._deaf = 0
-        self._quality: int | None = None
+        self._deaf = 0  # number of consecutive unanswered requests
+        self._quality: int | None = None  # reply to the periodic request: the quality of the Wi-Fi link
         self._rc_ns = 0
         self._flips: list[str] = []
         self._reported_ports = False
@@ -245,13 +244,11 @@ class TelloSession(VehicleSession):
             self._set_link_state(LinkState.UP)
         for event in self._health.changes(state):
             self._publish_event(event)
-        native = native_of(state)
-        native.update(self._telemetry())
+        native: dict[str, Value] = {**dict(state.fields), **self._telemetry()}  # names and units are the drone's own
         feedback = feedback_of(state, self.setpoints.flight_state(), now_ns, self.options.velocity_axes, native)
         self._pending.append(lambda sink: sink.feedback(feedback))
 
     def diagnose(self) -> list[Diagnostic]:
-        """Return preflight findings based on the drone's latest state."""
         return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
@@ -262,14 +259,14 @@ class TelloSession(VehicleSession):
             return
         if self._received_ns is None:
             self._answered = True
-            self._look_at_refused_ports(reply)
+            self._report_refused_ports(reply)
             return
         motion = self.conversation.on_reply(reply)
         if motion is not None:
             self.setpoints.on_answer(motion, reply, now_ns)
         self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
 
-    def _look_at_refused_ports(self, reply: str) -> None:
+    def _report_refused_ports(self, reply: str) -> None:
         if self.options.own_ports and is_error(reply) and not self._reported_ports:
             self._reported_ports = True
             text = (
@@ -360,7 +357,7 @@ class TelloSession(VehicleSession):
     def _describe_silence(self, since: str, why: str) -> str:
         if self._answered:
             why += f", though it answers: does a firewall of this host block UDP port {self.options.state_port}?"
-        if self.options.host == DEFAULT_HOST and self.local and not self.local.startswith(_TELLOS_NETWORK):
+        if self.options.host == HOST and self.local and not self.local.startswith(_TELLOS_NETWORK):
             why += f"; this computer is in no network of a Tello, its address is {self.local}"
         return f"no state{since} from {self._place}{why}"
 

@@ -20,7 +20,7 @@ from skyloop.vehicles.tello.wire import GROUND_CM, Pad, State, Vector
 
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 
-STANDARD_GRAVITY: Final = 9.80665  #: m/s²
+STANDARD_GRAVITY: Final = 9.80665  #: [m/s²]
 
 
 def height_m(state: State) -> float | None:
@@ -72,11 +72,6 @@ def feedback_of(
         else (acceleration[0] * factor, -acceleration[1] * factor, -acceleration[2] * factor),
         native=native,
     )
-
-
-def native_of(state: State) -> dict[str, Value]:
-    """Return the state with the drone's own names and units."""
-    return dict(state.fields)
 
 
 def _angle(degrees: float | None) -> float | None:
@@ -166,7 +161,8 @@ class FlightWatch:
 
     def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
         """Return whether a landed drone has taken off. Carrying the drone around does not count as a take-off."""
-        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns  # else they ran before the landing
+        # A count that increased before the landing says nothing about this take-off.
+        begun = self._counted_ns is not None and self._counted_ns > self._phase_ns
         if self.rising and (high or (motors and begun)):
             return True
         return bool(high and motors and in_phase_ns > GRACE_NS)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 FRONT: Final = "front"
 BOTTOM: Final = "bottom"
-WIDTH: Final = 960
+WIDTH: Final = 960  #: width of the front camera's full-size images [px]
 _CALIBRATION: Final = Intrinsics(
     921.170702, 919.018377, 459.904354, 351.238301, distortion=(-0.033458, 0.105152, 0.001256, -0.006647, 0.0)
 )
@@ -160,8 +160,8 @@ class TelloVideo:
         self._concealed = concealed
         self._on_whole = on_whole
         self._came: int | None = None  # number of the previous image
-        self.waited = 0
-        self.damaged = 0
+        self.waited = 0  #: number of images skipped while waiting for a key frame
+        self.damaged = 0  #: number of images with damage
         self._strict: VideoCodecContext | None = None
         self._patching: VideoCodecContext | None = None
         self._units: list[bytes] = []  # access units since the key frame, while there is no damage

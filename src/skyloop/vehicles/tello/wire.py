@@ -33,7 +33,7 @@ HOST: Final = "192.168.10.1"  #: address of a Tello that is its own access point
 SILENCE_S: Final = 15.0  #: time without a command after which the Tello lands
 
 ENTER: Final = "command"  #: command that must be sent first
-MAX_STICK: Final = 100
+MAX_STICK: Final = 100  #: value of ``rc`` for a full stick
 #: Effect of a stick at 100; an estimate, because no guide gives it. Users assume that ``rc`` is in cm/s and degrees/s.
 FULL_SPEED_M_S: Final = 1.0
 FULL_CLIMB_M_S: Final = 1.0
@@ -119,7 +119,6 @@ READ: Final = {
 
 
 def shape_of(command: str) -> Shape:
-    """Return the format of a command's reply."""
     return READ.get(command, Shape.OK)
 
 
@@ -136,7 +135,7 @@ def answers(reply: str, command: str) -> bool:
     return is_error(reply) or shape_of(command).value.match(reply) is not None
 
 
-MAX_STATE: Final = 1024
+MAX_STATE: Final = 1024  #: maximum length [bytes]; real state strings are much shorter
 FIELDS: Final = 64  #: maximum number of fields, which is more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's value for "nothing measured"
 GROUND_CM: Final = 10  #: the distance sensor's reading on the ground, its minimum
@@ -262,7 +261,7 @@ class AccessUnit:
     arrived_ns: int  #: when the image's first piece arrived
     after_gap: bool  #: whether an earlier image is known to be missing or damaged
     whole: bool  #: whether the image seems to be complete
-    number: int = 0  #: count of images that have arrived
+    number: int = 0  #: number of this image, counted from 0
     width: int = 0  #: width according to the newest parameter set [px]; 0 before the first parameter set
     height: int = 0
 

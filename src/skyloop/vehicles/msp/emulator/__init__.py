@@ -45,10 +45,10 @@ from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, USUAL_MAP, Function, 
 __all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]
 
 PORT: Final = 5761  #: TCP port of the first serial port in Betaflight's SITL
-CHANNELS: Final = 18
+CHANNELS: Final = 18  #: number of receiver channels in Betaflight
 HOVER_THROTTLE: Final = 0.32  #: hover throttle as a fraction of full throttle; an estimate
 THRUST_POWER: Final = 1.6  #: exponent with which thrust depends on throttle; an estimate
-CELLS: Final = 4
+CELLS: Final = 4  #: number of battery cells
 
 #: A 5-inch quadrotor with a four-cell battery. The values are typical estimates.
 RACER: Final = VehicleParameters(
@@ -65,7 +65,7 @@ RACER: Final = VehicleParameters(
     battery_charge_c=5400.0,  # 1500 mAh
     hover_power_w=120.0,
 )
-REPORTS_HZ: Final = 100.0
+REPORTS_HZ: Final = 100.0  #: rate at which the simulation reports to the flight controller
 _ACTUAL: Final = AxisRates(7, 0, 67)
 #: Betaflight's default rates: 70 degrees/s near the centre of a stick, 670 at its end.
 USUAL_RATES: Final = Rates("actual", _ACTUAL, _ACTUAL, _ACTUAL)
@@ -151,6 +151,7 @@ def with_racers(options: SimOptions | None = None) -> SimOptions:
     return replace(options or SimOptions(), parameters=RACER, rate_hz=REPORTS_HZ, cameras=())
 
 
+#: The identity of Betaflight 4.6.0.
 API: Final = (1, 47)
 VERSION: Final = (4, 6, 0)
 NAME: Final = "EMULATED"
@@ -162,7 +163,7 @@ IDLE: Final = 0.055  #: fraction of full throttle at which the motors idle while
 LEVEL_RAD: Final = math.radians(25.0)  #: maximum tilt at which arming is possible
 GROUND_M: Final = 0.06  #: height below which a vehicle with low thrust counts as on the ground
 ORIGIN: Final = EarthOrigin(47.0, 8.0, 400.0, 6_371_000.0)  #: arbitrary position of the world's origin on Earth
-SATELLITES: Final = 14
+SATELLITES: Final = 14  #: reported number of satellites, enough for a fix
 _ROLL, _PITCH, _YAW, _THROTTLE = range(4)
 
 

@@ -66,6 +66,9 @@ def rate_curve(kind: str, rates: AxisRates) -> Curve:
     return makers[kind](rates) if kind in makers else lambda stick: 200.0 * stick
 
 
+# The curves and their numbers are those of Betaflight's src/main/fc/rc.c (applyBetaflightRates and so on).
+
+
 def _bent(stick: float, expo: float, power: int) -> float:
     return stick * (1 - expo) + expo * stick**power
 

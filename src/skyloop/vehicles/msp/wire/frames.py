@@ -14,7 +14,7 @@ from typing import Final
 
 MOST: Final = 1024  #: longest payload that the parser waits for; the longest in use, mode names, is below 700 bytes
 LONG: Final = 255  #: version 1 size meaning that the next two bytes hold the actual size
-LARGEST: Final = 0xFFFF
+LARGEST: Final = 0xFFFF  #: largest function number and payload size, which have 16 bits
 
 
 class Direction(Enum):
@@ -31,11 +31,9 @@ _V2: Final = struct.Struct("<BHH")
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """An MSP frame."""
-
     function: int  #: 0 to 65535; 255 and greater only in version 2
     payload: bytes = b""  #: at most 65535 bytes
-    direction: Direction = Direction.REQUEST  #: the direction
+    direction: Direction = Direction.REQUEST
 
 
 def _crc_table() -> tuple[int, ...]:

@@ -101,7 +101,6 @@ def api_version(payload: bytes) -> tuple[int, int]:
 
 
 def version(payload: bytes) -> tuple[int, int, int]:
-    """Return the firmware's version."""
     major, minor, patch = _unpack(struct.Struct("<BBB"), payload, "FC_VERSION")
     return major, minor, patch
 
@@ -147,7 +146,6 @@ class Status:
     load: int = 0  #: processor load [%]
 
     def has(self, sensor: Sensor) -> bool:
-        """Return whether this sensor is present."""
         return bool(self.sensors >> sensor & 1)
 
     @classmethod
@@ -192,7 +190,6 @@ class Attitude:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``ATTITUDE``."""
         roll, pitch, heading = _unpack(_ATTITUDE, payload, "ATTITUDE")
         return cls(roll / 10, pitch / 10, float(heading))
 
@@ -209,7 +206,6 @@ class Altitude:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``ALTITUDE``."""
         height, climb = _unpack(_ALTITUDE, payload, "ALTITUDE")
         return cls(height / 100, climb / 100)
 
@@ -221,8 +217,8 @@ class Altitude:
 class Battery:
     """The battery's state."""
 
-    voltage_v: float  #: [V]
-    current_a: float  #: [A]
+    voltage_v: float
+    current_a: float
     cells: int = 0  #: number of cells; 0 if unknown
     left: float | None = None  #: remaining charge, 0 to 1; None if not reported
 
@@ -267,7 +263,6 @@ class CellVoltages:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``BATTERY_CONFIG``."""
         low, high = _unpack(struct.Struct("<BB"), payload, "BATTERY_CONFIG")
         return cls(low / 10, high / 10)
 
@@ -286,7 +281,6 @@ class Gps:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``RAW_GPS``."""
         fix, satellites, latitude, longitude, altitude, speed, course = _unpack(_GPS, payload, "RAW_GPS")
         return cls(bool(fix), satellites, latitude / 1e7, longitude / 1e7, altitude, speed / 100, course / 10)
 
@@ -306,7 +300,6 @@ class Imu:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``RAW_IMU``."""
         a, b, c, d, e, f, g, h, i = _unpack(_IMU, payload, "RAW_IMU")
         return cls((a, b, c), (d, e, f), (g, h, i))
 
@@ -386,7 +379,6 @@ class FailsafeConfig:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``FAILSAFE_CONFIG``."""
         delay, landing, throttle, _, low, procedure = _unpack(_FAILSAFE, payload, "FAILSAFE_CONFIG")
         return cls(delay / 10, float(landing), throttle, low / 10, procedure)
 
@@ -425,7 +417,6 @@ class RxConfig:
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Read ``RX_CONFIG``."""
         _, high, middle, low, _, least, most = _unpack(_RX, payload, "RX_CONFIG")
         return cls(low, middle, high, least, most)
 
@@ -451,7 +442,7 @@ def features(payload: bytes) -> int:
     return bits
 
 
-ANGLE_LIMIT_AT: Final = 17
+ANGLE_LIMIT_AT: Final = 17  #: offset of the limit in ``PID_ADVANCED``
 
 
 def angle_limit_deg(payload: bytes) -> int:

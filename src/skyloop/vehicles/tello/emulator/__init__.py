@@ -42,8 +42,7 @@ from skyloop.vehicles.emulation.emulator import (
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import Encoder, Format, OneCamera, Piece, VideoEncoding, require_encoder
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
-from skyloop.vehicles.tello.emulator.telemetry import MOST
-from skyloop.vehicles.tello.wire import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PORT, Sdk, pieces
+from skyloop.vehicles.tello.wire import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PADS, PORT, Sdk, pieces
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
 __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
 
-REPORTS_HZ: Final = 50.0
+REPORTS_HZ: Final = 50.0  #: rate at which the simulation reports to the logic
 TAKEOFF_ALTITUDE_M: Final = 0.8  #: height at the end of a take-off, as in a recorded flight
 
 #: A small, light drone. Mass, size and flight time come from Ryze's Tello specifications; it has 3-inch rotors. All
@@ -112,11 +111,11 @@ class Settings:
     pads: Mapping[int, tuple[float, float]]  #: x and y in the world by pad number
 
 
-STATE_HZ: Final = 10.0
+STATE_HZ: Final = 10.0  #: rate of the state strings, as in the SDK's guides
 GROUP: Final = 30  #: number of images from one key frame to the next
 FULL_KBPS: Final = 2500  #: bitrate that makes images of about 10 kB
-LEAST_KBPS: Final = 300
-BUFFER_S: Final = 0.1
+LEAST_KBPS: Final = 300  #: lowest automatic bitrate, an estimate
+BUFFER_S: Final = 0.1  #: buffer of the encoder's rate control; short, to keep images about equally large
 
 
 def automatic_kbps(loss: float) -> int:
@@ -276,8 +275,8 @@ class TelloFirmware(Emulator[RunningFirmware]):
         if sdk not in list(Sdk):
             raise UsageError(f"sdk must be one of {', '.join(Sdk)}, got {sdk!r}")
         for number in pads or {}:
-            if not 1 <= number <= MOST:
-                raise UsageError(f"mission pads are numbered from 1 to {MOST}, got {number!r}")
+            if number not in PADS:
+                raise UsageError(f"mission pads are numbered from {PADS[0]} to {PADS[-1]}, got {number!r}")
         require_encoder("the video of an emulated Tello")
         super().__init__(host, drone)
         self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))

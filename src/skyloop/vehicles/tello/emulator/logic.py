@@ -108,7 +108,7 @@ class Turning:
 
 
 class Going:
-    """Motions through waypoints in world axes [m]: moves, ``go`` and ``curve``."""
+    """Moves, ``go`` and ``curve``: flights through waypoints in world axes [m]."""
 
     def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
         self._places = list(places)

@@ -13,9 +13,8 @@ from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleTruth
 from skyloop.vehicles.tello.wire import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, Sdk, build
 
-MOST: Final = 8
-LOWEST_M: Final = 0.3  #: minimum height at which pads are recognised; an estimate, like the maximum
-HIGHEST_M: Final = 1.2
+LOWEST_M: Final = 0.3  #: minimum height at which pads are recognised; an estimate
+HIGHEST_M: Final = 1.2  #: maximum height at which pads are recognised; an estimate
 _VIEW: Final = 0.5  # horizontal reach of the downward camera as a fraction of the height; an estimate
 
 

@@ -1,4 +1,4 @@
-import{a as ll,h as fe,p as cl}from"./chunk-TUG2NFWM.js";/**
+import{a as ll,h as fe,p as cl}from"./chunk-6D6NKLYC.js";/**
  * @license
  * Copyright 2010-2025 Three.js Authors
  * SPDX-License-Identifier: MIT
