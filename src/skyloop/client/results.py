@@ -229,7 +229,7 @@ class ResultChannel(Channel[Result]):
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:
-        """Publish a result unless a newer one was; return False if it has already arrived on the other topic."""
+        """Publish a result unless one for a later frame was; return False if it already came on the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -279,11 +279,10 @@ class ResultChannels:
             return found
 
     def all(self) -> list[ResultChannel]:
-        """Return all channels."""
         return list(self._channels.values())
 
     def next_number(self, processor: str) -> int:
-        """Return the number of this application's next result. Each processor may have only one worker at a time."""
+        """Return the number of the next result; this application may run only one worker per processor."""
         self._sent[processor] += 1
         return self._sent[processor]
 
@@ -293,7 +292,6 @@ class ResultChannels:
             channel.restart()
 
     def receive(self, header: ProcessorResult, now_ns: int) -> None:
-        """Publish a result received at ``now_ns``."""
         offset_ns = self._connection.offset_ns
         result = Result(header, now_ns, offset_ns, self._history, self._scheduler.clock)
         channel = self._channels.get(header.processor)

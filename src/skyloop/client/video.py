@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MOST_WAITING: Final = 6
 IDLE_KEPT: Final = 32  #: maximum number of channels of each kind to keep; beyond this, unread channels are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key frame before requesting it again
-_IDLE_S: Final = 2.0
+_IDLE_S: Final = 2.0  #: time without frames after which a decoding thread ends
 _PURPOSE: Final = "reading H.264"
 
 
@@ -139,7 +139,6 @@ class VideoChannel(Channel[Arrival]):
         self.watch.received_ns = now_ns
 
     def stats(self, now_ns: int) -> ChannelStats:
-        """Return the statistics at ``now_ns``."""
         return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
 
     def _period_s(self, fps: float) -> float:
@@ -216,7 +215,7 @@ class StreamDecoder:
                 self._waiting.clear()
             elif follows and len(self._waiting) >= MOST_WAITING:
                 self._chain.restart()
-                follows = False
+                follows = False  # decoding has fallen behind: skip to the next key frame
             if follows:
                 self._waiting.append((picture, self._clock()))
                 if not self._running:
@@ -390,7 +389,6 @@ class VideoChannels:
                 channel.receive(header, pixels, now_ns, as_asked=False)
 
     def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
-        """Deliver a frame of an encoded stream."""
         channel = self.streams.get(picture.topic or stream(picture.camera))
         if channel is not None:
             channel.receive(picture)
