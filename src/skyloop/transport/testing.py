@@ -17,7 +17,7 @@ import numpy as np
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.transport.base import Peer, Pixels, TransportClient
 
-PATIENCE_S: Final = 15.0
+PATIENCE_S: Final = 15.0  #: generous, because a busy machine must not fail the tests
 FRONT: Final = "front"
 
 

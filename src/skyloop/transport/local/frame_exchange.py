@@ -224,7 +224,7 @@ class Camera:
 
 
 class FrameExchange:
-    """Manages all cameras of a server. Thread-safe. Frames are copied while the lock of the exchange is not held."""
+    """Manages all cameras of a server. Thread-safe. Frames are copied without holding the lock."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
