@@ -69,7 +69,7 @@ FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
 #: The channels and their periods [s], from the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
-LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
+LARGEST: Final = (1920, 1080)  #: largest frame size [px]
 
 _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
@@ -204,7 +204,6 @@ class BenchVehicle(Driver):
         return action
 
     def show(self, captured_ns: int, image: Image) -> None:
-        """Publish a frame."""
         if (sink := self._sink) is not None:
             height, width, _ = image.shape
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
@@ -216,7 +215,6 @@ class BenchVehicle(Driver):
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the proxy to measure."""
     return Path(folder).name.lower()
 
 
@@ -232,12 +230,10 @@ class Vehicle:
         self._proxy.start()
 
     def _server(self, folder: str) -> tuple[str, TransportServer]:
-        """Return the proxy's name and its transport server."""
         name = proxy_name(folder)
         return name, LocalServer(name)
 
     def feedback(self, sent_ns: int) -> None:
-        """Send feedback."""
         self._vehicle.publish_feedback(sent_ns)
 
     def frame(self, sent_ns: int, image: Image) -> None:
@@ -245,7 +241,6 @@ class Vehicle:
         self._vehicle.show(sent_ns, image)
 
     def close(self) -> None:
-        """Close the proxy."""
         self._proxy.end()
 
 
@@ -257,17 +252,14 @@ class Listening:
         self._known_ns = 0
 
     def feedback(self, feedback: Feedback) -> None:
-        """Report new feedback."""
         if feedback.captured_ns > self._known_ns:  # when the authority changes hands, the proxy repeats the last state
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
 
     def frame(self, frame: Frame) -> None:
-        """Report a frame."""
         self._received(VIDEO, frame.captured_ns)
 
     def picture(self, picture: EncodedFrame) -> None:
-        """Report an encoded frame."""
         self._received(VIDEO, picture.captured_ns)
 
 
@@ -288,12 +280,10 @@ class Application:
         return connect(proxy_name(folder), name="bench", on_exit="hover")
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:
-        """Send a set-point."""
         forward, left, yaw_rate = setpoint
         self._drone.velocity(forward=forward, left=left, up=stamped(sent_ns), yaw_rate=yaw_rate)
 
     def close(self) -> None:
-        """Close the drone."""
         self._drone.close()
 
 
@@ -597,7 +587,7 @@ FLEETS: Final = (
     Fleet("empty", 100, "crazyflie"),
 )
 SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 is the cameras' own size, 2 is twice as wide
-CAMERAS_AT_ONCE: Final = 10
+CAMERAS_AT_ONCE: Final = 10  #: number of drones that see each other, each with its front camera
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
 FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; the drones fly for one period between images
 #: Number of steps per batch: a multiple of all periods, which makes every batch do the same work.
@@ -743,10 +733,10 @@ class Flight:
 
 
 class _Hops:
-    """Firmware that makes a drone hop. It reads all sensors but computes nothing from them."""
+    """Firmware that makes a drone hop. Simulating all sensors for it takes time; its own computation does not."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return full thrust near the ground and zero thrust above."""
+        """Return a high thrust near the ground and a low one above 0.5 m, as fractions of the maximum."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 

@@ -9,11 +9,14 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import msgspec
 
 from skyloop.errors import FileFormatError, UsageError
+
+if TYPE_CHECKING:
+    from _typeshed import FileDescriptorLike
 
 T = TypeVar("T")
 
@@ -58,16 +61,10 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
         raise FileFormatError(f"{path} is not {what}: {error}") from None
 
 
-class Descriptor(Protocol):
-    """Anything with a file descriptor."""
-
-    def fileno(self) -> int: ...
-
-
-def wait_readable(source: Descriptor | int, within_s: float) -> bool:
+def wait_readable(source: FileDescriptorLike, within_s: float) -> bool:
     """Wait until a descriptor is readable or closed; return False if neither happens within ``within_s`` [s].
 
-    Works for any descriptor number; ``select.select`` raises an error from 1,024 on.
+    Works for any descriptor number; ``select.select`` raises an error for 1,024 and above.
     """
     if not hasattr(select, "poll"):  # Windows
         return bool(select.select([source], [], [], within_s)[0])
@@ -77,7 +74,7 @@ def wait_readable(source: Descriptor | int, within_s: float) -> bool:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; return a path with an unknown user unchanged, which won't be found."""
+    """Expand ``~`` to the home directory; leave the path of an unknown user unchanged, so that it won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:
