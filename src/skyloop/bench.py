@@ -290,7 +290,7 @@ class Application:
 # The bare connection ------------------------------------------------------------------------------------------------
 
 _STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with a size of zero, and three numbers: 100 bytes, as in Skyloop
+_PACKET: Final = struct.Struct("<qqq3d52x")  # a stamp of size 0, three numbers, and padding to 100 bytes as in Skyloop
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 

@@ -95,7 +95,7 @@ def ask(drone: Drone, action: AnyAction) -> int:
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
-    """Hover or land because the library, and not a person, has decided to do so. Never raises.
+    """Hover or land because the library, rather than a person, has decided to do so. Never raises.
 
     Does nothing if someone else flies the vehicle, if it is landing or returning, or if the application itself landed
     or stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.

@@ -143,7 +143,7 @@ def _tables(info: inspect.Type) -> list[inspect.StructType]:
 
 
 def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
-    """Return each key's type and whether it is required; of several kinds, use the one that the table names."""
+    """Return each key's type and whether it is required; if several kinds are possible, the table names its kind."""
     kinds = _tables(info)
     tag = kinds[0].tag_field
     fields: dict[str, tuple[inspect.Type, bool]] = {}

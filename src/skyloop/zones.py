@@ -30,7 +30,7 @@ Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane, given by the unit vector towards it in world axes and by its distance [m]; negative beyond the plane."""
+    """A plane, given by a unit vector towards it (world axes) and the distance to it [m], negative beyond the plane."""
 
     normal: Vec3
     distance: float
@@ -214,7 +214,7 @@ def parse_zones(text: str) -> tuple[Zone, ...]:
     """
     zones = [_parse_zone(part) for part in text.split(";") if part.strip()]
     if len(zones) > MAX_ZONES:
-        raise _wrong(f"{len(zones)} zones were given, at most {MAX_ZONES} are possible")
+        raise _wrong(f"{len(zones)} zones were given, at most {MAX_ZONES} are allowed")
     return tuple(zones)
 
 

@@ -274,7 +274,7 @@ class Drone:
     Methods have the same names, arguments, results and errors as in :class:`skyloop.Drone`; those that wait are
     coroutines. Callbacks are plain or coroutine functions, and run on the event loop that was running when they were
     added. Image callbacks are the exception: they are plain functions that run in their own threads, because image
-    processing would block the event loop. The function that :meth:`wait` tests feedback with is a plain function, too.
+    processing would block the event loop. The test passed to :meth:`wait` must be a plain function, too.
     """
 
     sync: client.Drone  #: wrapped drone
@@ -382,9 +382,10 @@ class Swarm:
         return f"<aio.{repr(self.sync)[1:]}"
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` for all active drones concurrently on this event loop. Cancelling it cancels all of them.
+        """Await ``function`` for all active drones concurrently on this event loop.
 
-        A coroutine function. Exceptions, ``what`` and the result work as in :meth:`skyloop.Swarm.each`.
+        Cancelling this coroutine cancels all of its calls. Exceptions, ``what`` and the result work as in
+        :meth:`skyloop.Swarm.each`.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}

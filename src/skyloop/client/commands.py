@@ -88,7 +88,7 @@ class CommandSender:
         """Prepare for sending; nothing is sent before :meth:`connected` is called.
 
         ``emit`` receives the events created here. ``changed`` is called when the status of the authority has changed,
-        and ``granted`` is called with the number of each new lease. Both run on the thread that noticed.
+        and ``granted`` is called with the number of each new lease. Both run on the thread that noticed the change.
         """
         self.role = role
         self._authority = authority
@@ -217,8 +217,9 @@ class CommandSender:
     ) -> tuple[int, bool]:
         """Make ``action`` the newest set-point and send it if possible; return its intent and whether it was sent.
 
-        Nothing can be sent while the link is down, the person flying is absent, or the authority or the effect of an
-        emergency stop is awaited. Raises :class:`GivenUpError` if the caller has stopped waiting (:data:`cancelled`).
+        Nothing can be sent while the link is down or the person flying is absent, nor before the authority is granted
+        or an emergency stop confirmed. Raises :class:`GivenUpError` if the caller has stopped waiting
+        (:data:`cancelled`).
         """
         connection, schedule, authority = self._connection, self.schedule, self._authority
         if connection.why_closed:
@@ -489,7 +490,7 @@ class CommandSender:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""
         not_sent = f"{action.name} was not sent"
         if self._authority.held and self._connection.connected:
-            return AuthorityError(f"{not_sent}: the person who flies is not known to be present", code="no_authority")
+            return AuthorityError(f"{not_sent}: the person flying is not known to be present", code="no_authority")
         if self._connection.connected:
             text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
             return AuthorityError(text, code="no_authority")

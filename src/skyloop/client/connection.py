@@ -188,7 +188,7 @@ class ProxyConnection:
         while not self.closing:
             left_s, sent = deadline - time.monotonic(), self.session is not None
             self.ask(body(), done, max(left_s, 0.001))
-            notifier.wait_for(lambda: bool(answers), left_s + 1.0)
+            notifier.wait_for(lambda: bool(answers), left_s + 1.0)  # the supervisor reports the time-out, maybe late
             answer = answers.pop() if answers else NoAnswerError("the link's thread has ended")
             if not isinstance(answer, LinkError):
                 return answer
@@ -196,7 +196,7 @@ class ProxyConnection:
                 raise NoAnswerError(f"{answer} (time-out {timeout_s:g} s)") from answer
             if sent and not may_repeat():
                 raise LinkError(f"{answer}, after the request was sent: it may have been carried out") from answer
-            notifier.wait_for(lambda: self.closing, 0.02)
+            notifier.wait_for(lambda: self.closing, 0.02)  # the link is down: try again soon
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:

@@ -27,7 +27,7 @@ class Thresholds:
     silent_s: float = 1.0  #: time without any packet after which the link is reconnected
     missing_share: float = 0.1  #: fraction of missing or malformed samples in a window that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: number of malformed packets in a window at which the link is reconnected
+    malformed: int = 5  #: number of malformed packets in a window after which the link is reconnected
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,6 +192,7 @@ class OffsetEstimator:
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
         """Add a round trip that was answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
+        # Both clocks are read in whole nanoseconds, so each bound may be off by 1.
         self._trips.append((sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
 

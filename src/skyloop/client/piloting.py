@@ -135,8 +135,8 @@ class Piloting:
 
         Because the library decides this, not a person, the vehicle is left alone if others are flying it, if it is
         landing or returning, or if this application has landed or stopped it. The proxy applies the same rule. A
-        take-off without visible effect is cancelled. With ``land``, it lands instead of hovering. Returns whether
-        anything was sent.
+        take-off without visible effect is cancelled. With ``land``, the vehicle lands instead of hovering. Returns
+        whether anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):

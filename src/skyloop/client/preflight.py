@@ -28,7 +28,7 @@ LEVEL_RAD: Final = 0.12  #: maximum tilt at which a vehicle counts as level [rad
 ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one camera at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: free disk space below which the storage check warns
-FULL_BYTES: Final = 100_000_000  #: free disk space below which it fails
+FULL_BYTES: Final = 100_000_000  #: free disk space below which the storage check fails
 FAR_M: Final = 10_000.0  #: a wall of the safety box is ignored if it is at least this far away [m]
 
 
@@ -226,7 +226,7 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
             Level.WARN,
             f"another controller has it: {feedback.others}",
             "the proxy leaves it alone until a pilot commands hover, landing or take-off",
-            "agree with the person who flies it",
+            "agree with the person flying it",
         )
     else:
         yield _ok("vehicle", str(feedback.state).replace("_", " "))

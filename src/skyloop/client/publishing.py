@@ -59,7 +59,7 @@ class Logbook:
         if name != "":
             _named(name)
         if not isinstance(text, str) or len(text) > MAX_LOG_TEXT:
-            raise UsageError(f"only texts of at most {MAX_LOG_TEXT} characters can be logged, got {text!r:.80}")
+            raise UsageError(f"only strings of at most {MAX_LOG_TEXT} characters can be logged, got {text!r:.80}")
         try:
             known = Severity(severity)
         except ValueError:

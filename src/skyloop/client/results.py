@@ -98,7 +98,7 @@ class Result:
     def to(self, kind: type[T]) -> T:
         """Convert the value to a dataclass, ``msgspec.Struct`` or other type; raise :class:`DecodeError` on failure."""
         try:
-            return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
+            return msgspec.convert(self.value, kind, dec_hook=lambda _kind, value: value)  # arrays stay as they are
         except (msgspec.ValidationError, TypeError) as error:
             raise DecodeError(f"a result of {self.processor} is not a {kind.__name__}: {error}") from None
 
@@ -110,10 +110,6 @@ class Result:
     def __repr__(self) -> str:
         header = self.header
         return f"<Result of {header.processor} for {header.camera} {header.seq}, {self.age_s * 1e3:.0f} ms old>"
-
-
-def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (signature of msgspec's hook)
-    return value
 
 
 class ResultMailbox:
@@ -189,7 +185,7 @@ class ResultListener(Listener[Result]):
     """A listener that skips results that are too old when delivered, and counts them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
-        """Start calling the function; ``max_age_s`` [s], None: no limit; other arguments as for :class:`Listener`."""
+        """Start calling the function, but skip results older than ``max_age_s``; for the rest see :class:`Listener`."""
         self.expired = 0  #: number of results too old when they would have been delivered
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
@@ -207,7 +203,7 @@ class ResultListener(Listener[Result]):
 
 
 class ResultChannel(Channel[Result]):
-    """Results of one processor, without those for frames older than the frame of an earlier result."""
+    """Results of one processor; a result that arrives after one for a later frame of its camera is skipped."""
 
     def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
         self.name = results(processor)  #: name of the topic

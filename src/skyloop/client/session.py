@@ -232,7 +232,7 @@ class ProxySession:
     def tick(self, now_ns: int) -> None:
         """Repeat due requests; ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
-        late_ns = self.monitor.late_ns  # time without data before the proxy is pinged
+        late_ns = self.monitor.late_ns
         silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST_TRIPS else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged

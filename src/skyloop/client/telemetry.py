@@ -118,13 +118,12 @@ class Mailboxes:
 class FeedbackDemand:
     """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
-    A pilot always gets every sample in full, because samples report its link, its authority and failsafes. An observer
-    does too, until a consumer limits its request, or whenever a consumer needs every sample. Each connection uses one
-    variant.
+    A pilot always gets every sample, because samples report its link, its authority and failsafes. So does an observer
+    unless it has consumers and all of them have limited their rate.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription never changes afterwards."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request

@@ -82,6 +82,7 @@ class VideoChannel(Channel[Arrival]):
         self.counter = ChannelCounter()
         self.undecodable = 0
         self.too_old = 0  #: number of frames rejected because they exceeded a consumer's ``max_age_s``
+        # A camera that misses five frames has stalled, but a fast camera gets a second.
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         chosen = self.request.part is not None or self.request.max_fps is not None
         #: Selects the frames for this request from the full stream; None if the request includes all frames.
@@ -174,7 +175,7 @@ class StreamChannel(Channel[EncodedFrame]):
     def report(self, seq: int, *, wants_key: bool = False) -> None:
         """Report the newest frame to the proxy, which adapts its rate to the path accordingly. Thread-safe.
 
-        ``wants_key``: whether a missing frame prevents decoding; such reports are limited to a few a second.
+        ``wants_key``: whether a missing frame prevents decoding; a key frame is requested at most every 0.3 s.
         """
         if not self._encoded_here:
             return
@@ -187,7 +188,7 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream, in order, in a thread of its own. After an undecodable frame, it skips to the next key frame.
+    """Decodes one stream, in order, on its own thread. After an undecodable frame, it skips to the next key frame.
 
     ``deliver`` is called on that thread with each image's header, pixels (BGR) and arrival time [ns].
     """

@@ -157,7 +157,7 @@ class VideoEvent(Enum):
 
     STREAMING = "streaming"  #: frames are arriving
     LOST = "lost"  #: the connection was lost or is not established yet; reported once per reason, retried forever
-    UNSUPPORTED = "unsupported"  #: frames use another codec, or the data is invalid; reported once per series
+    UNSUPPORTED = "unsupported"  #: frames use an unsupported codec, or the data is invalid; reported once per series
     FAULT = "fault"  #: an error in this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
@@ -461,7 +461,7 @@ class CheckedRelay:
 
     @property
     def wanted(self) -> bool:
-        """Whether anyone wants the stream at present."""
+        """Whether anyone currently wants the stream."""
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:

@@ -351,7 +351,7 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
 
     @abstractmethod
     def _read(self, connection: C) -> None:
-        """Pass the received data to the session. On the link's thread, with the lock free.
+        """Pass the received data to the session. Called on the link's thread, without the lock.
 
         Raises ``OSError`` if the connection has ended.
         """

@@ -103,6 +103,7 @@ class RestartWatch:
 
     def _step(self, before: int, number: int) -> int:
         step = number - before
+        # Numbers that wrap jump by nearly the whole range. A smaller jump back is a late packet or a restart.
         if abs(step) < 0.99 * self._wrap or not self._wrap:
             return step
         return step + self._wrap if step < 0 else step - self._wrap

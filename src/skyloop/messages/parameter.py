@@ -37,7 +37,7 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     minimum: float | None = None
     maximum: float | None = None
     default: Value | None = None
-    choices: tuple[Value, ...] = ()  #: the only allowed values; empty if others are allowed
+    choices: tuple[Value, ...] = ()  #: the only allowed values; empty: any value of the type and range
     read_only: bool = False
     description: str = ""
     momentary: bool = False  #: whether writing it triggers an action, such as a flip; it has no lasting value

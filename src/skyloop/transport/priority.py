@@ -148,7 +148,7 @@ class PriorityLock:
         if self._taken.acquire(False):  # the most frequent case, handled in as few steps as possible
             self._owner = me
             return
-        if self._owner == me:
+        if self._owner == me:  # only this thread can have stored its identity, so no lock is needed to check
             self._depth += 1
             return
         woken = threading.Lock()

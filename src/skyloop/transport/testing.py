@@ -49,7 +49,7 @@ class ServerLog:
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
         self.refusals: list[tuple[Peer, str]] = []
-        self.problems: dict[str, str] = {}  #: the reasons why these topics can't be subscribed to
+        self.problems: dict[str, str] = {}  #: by topic, the reason why it can't be subscribed to
         self.complaints: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 

@@ -157,7 +157,7 @@ class Directory:
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
-        """Lock the directory against changes by others; :class:`LinkError` if another process holds it for longer."""
+        """Lock the directory against changes by others; :class:`LinkError` if this takes longer than ``timeout_s``."""
         here, path = self._lstat(self.path), self.path
         flags = os.O_RDONLY | os.O_DIRECTORY
         if here.st_mode & stat.S_IRWXG:

@@ -39,7 +39,7 @@ class SlotMemory:
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
         """Reserve the memory [bytes]. Raises ``OSError`` if memory or descriptors run out."""
-        self.fd = -1
+        self.fd = -1  # for __del__, if reserving the memory fails
         self.number = number
         self.generation = generation
         self.capacity = capacity

@@ -101,7 +101,7 @@ class LocalServer(TransportServer):
         self._finish(listener)
 
     def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
-        """Wait until all ends have stopped."""
+        """Wait until the accepting thread and all receiving threads have ended."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
             thread.join()  # a handler that stops its own server must not wait for itself
