@@ -45,7 +45,7 @@ class Known:
     @property
     def is_far(self) -> bool:
         """Whether frames arrive over a network, in the encoding that each consumer requests."""
-        return self._drone._connection.variants
+        return self._drone._connection.adapts_frames
 
     @property
     def listeners(self) -> list[Listener[Any]]:

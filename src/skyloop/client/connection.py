@@ -90,10 +90,10 @@ class ProxyConnection:
         return session is not None and session.receiving
 
     @property
-    def variants(self) -> bool:
+    def adapts_frames(self) -> bool:
         """Whether the proxy adapts frames as requested; within one host, frames arrive unchanged."""
         session = self.session
-        return session is not None and session.variants
+        return session is not None and session.adapts_frames
 
     @property
     def offset_ns(self) -> int:

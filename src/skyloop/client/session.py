@@ -184,7 +184,7 @@ class ProxySession:
         self.requests.fail(error)
 
     @property
-    def variants(self) -> bool:
+    def adapts_frames(self) -> bool:
         """Whether frames arrive in the requested form; see :class:`skyloop.transport.base.TransportClient`."""
         return self._end.variants
 
@@ -215,7 +215,7 @@ class ProxySession:
     def subscribe(self, topic: str, on: bool) -> None:
         """Subscribe to or unsubscribe from a topic. Video that several requests share is subscribed to only once."""
         if topic.startswith(_VIDEOS):
-            carrier = _carrier(topic, variants=self.variants)
+            carrier = _carrier(topic, adapted=self.adapts_frames)
             users = self._video_users.setdefault(carrier, set())
             had_users = bool(users)
             (users.add if on else users.discard)(topic)
@@ -339,15 +339,15 @@ def frame_size(header: FrameHeader) -> int:
     return header.size if channels is None else header.width * header.height * channels
 
 
-def _carrier(topic: str, *, variants: bool) -> str:
+def _carrier(topic: str, *, adapted: bool) -> str:
     """Return the transport topic that carries the video of ``topic``.
 
-    ``variants``: whether the transport delivers frames in the requested form. If not, all frames arrive unchanged, and
-    each channel filters and scales them.
+    ``adapted``: whether frames arrive in the requested form. If not, all frames arrive unchanged, and each channel
+    filters and scales them.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):
         return topic
-    if not variants:
+    if not adapted:
         return request.plain.topic
     return request.stream_topic if request.encoding == "h264" else topic

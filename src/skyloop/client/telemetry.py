@@ -288,7 +288,7 @@ class ClientState:
                 malformed=self._connection.malformed,
             ),
         }
-        for channel in tuple(self.video.variants.values()):
+        for channel in tuple(self.video.by_topic.values()):
             found[channel.name] = channel.stats(now_ns)
         for results in self.results.all():
             found[results.name] = results.stats(now_ns)
@@ -297,7 +297,7 @@ class ClientState:
     def wake_all(self) -> None:
         """Wake every waiting thread to make it check its condition again."""
         self.notifier.notify()
-        for channel in tuple(self.video.variants.values()):
+        for channel in tuple(self.video.by_topic.values()):
             channel.notifier.notify()
         for results in self.results.all():
             results.notifier.notify()

@@ -168,7 +168,7 @@ class StreamChannel(Channel[EncodedFrame]):
         picture = self._pieces.add(part)
         if picture is None:
             return
-        if self.decoder is not None and self._connection.variants:  # without variants, frames arrive unchanged
+        if self.decoder is not None and self._connection.adapts_frames:  # otherwise, frames arrive unchanged
             self.decoder.put(picture)
         self.publish(picture)
 
@@ -281,7 +281,7 @@ class VideoChannels:
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
         self.channels: dict[str, VideoChannel] = {}  #: channels for the default request, by camera
-        self.variants: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
+        self.by_topic: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
         self.subscriber = secrets.token_hex(8)  #: identifies streams whose rate is adapted to the path of this client
         self._connection = connection
@@ -338,16 +338,16 @@ class VideoChannels:
         """Return the channel of a camera's frames as requested (None: :func:`usual`); create it on the first call."""
         topic = (request or usual(camera.name)).topic
         with self._making:
-            channel = self.variants.get(topic)
+            channel = self.by_topic.get(topic)
             if channel is None:
-                forget_idle(self.variants, keep=self.channels.values())
+                forget_idle(self.by_topic, keep=self.channels.values())
                 channel = VideoChannel(camera, self._connection, self._scheduler, self._history, request)
                 if channel.request.encoding == "h264":
                     encoded, deliver = self._made_stream(channel.request), partial(channel.receive, as_asked=True)
                     encoded.decoder = StreamDecoder(
                         encoded, deliver, self._scheduler.clock, f"skyloop-decode-{camera.name}"
                     )
-                self.variants[topic] = channel
+                self.by_topic[topic] = channel
         return channel
 
     def _made_stream(self, request: VideoRequest) -> StreamChannel:
@@ -356,21 +356,21 @@ class VideoChannels:
         with self._making:
             channel = self.streams.get(topic)
             if channel is None:
-                decoded = [one.request for one in self.variants.values() if one.request.encoding == "h264"]
+                decoded = [one.request for one in self.by_topic.values() if one.request.encoding == "h264"]
                 forget_idle(self.streams, keep={self.streams.get(one.stream_topic) for one in decoded})
                 channel = self.streams[topic] = StreamChannel(topic, self._connection, self._scheduler.clock)
         return channel
 
     def connected(self, cameras: Iterable[CameraInfo], now_ns: int) -> None:
         """Store the cameras of a newly connected proxy, which may count its frames from 0."""
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             channel.restart(now_ns)
         # The proxy may have restarted with different cameras, and its first camera may be a different one.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
         """Resubscribe to cameras that have stalled while other samples still arrive (``flows``)."""
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
 
@@ -380,11 +380,11 @@ class VideoChannels:
         ``topic`` names the request that the frame answers; empty: a plain frame of the camera, for all its channels.
         """
         if topic:
-            channel = self.variants.get(topic)
+            channel = self.by_topic.get(topic)
             if channel is not None:
                 channel.receive(header, pixels, now_ns, as_asked=True)
             return
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             mine, chosen = channel.subscribed and channel.camera.name == header.camera, channel.filter
             if mine and (chosen is None or chosen.wants(header.seq, header.captured_ns)):
                 channel.receive(header, pixels, now_ns, as_asked=False)
