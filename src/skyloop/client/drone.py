@@ -946,8 +946,6 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        if depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
         max_age_s = how.get("max_age_s")
@@ -992,8 +990,6 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        if depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
 
         def find() -> StreamChannel:
@@ -1121,14 +1117,13 @@ class Drone:
             UsageError: If ``function`` is not callable or another argument is out of range.
             ClosedError: If the drone was closed.
         """
-        if depth is not None and depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 result")
         known, make = self._state.results, partial(ResultListener, max_age_s=checked_age(max_age_s))
         if processor is None:
             channel, name, usual = known.everything, "results", EVENT_DEPTH
         else:
             channel, name, usual = known.channel(processor), f"results of {processor}", 1
-        listener = self._listen(channel, function, name, depth=depth or usual, inline=inline, make=make)
+        depth = usual if depth is None else depth
+        listener = self._listen(channel, function, name, depth=depth, inline=inline, make=make)
         assert isinstance(listener, ResultListener)
         return listener
 
@@ -1218,6 +1213,8 @@ class Drone:
         make: Callable[..., Listener[T]] = Listener,
     ) -> Listener[T]:
         self._check_listener(function)
+        if depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be at least 1")
         state, report = self._state, self._piloting.report
         inline = inline or state.scheduler.in_step
         listener = make(function, channel, report, name=name, depth=depth, inline=inline, on_cancel=state.forget)
