@@ -736,7 +736,7 @@ class _Hops:
     """Firmware that makes a drone hop. Simulating all sensors for it takes time; its own computation does not."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return a high thrust near the ground and a low one above 0.5 m, as fractions of the maximum."""
+        """Return high rotor commands near the ground and low ones above 0.5 m."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 

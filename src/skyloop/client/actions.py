@@ -61,7 +61,7 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     EmergencyStop: nanoseconds(0.1),
     ResetEmergency: nanoseconds(0.1),
 }
-#: Maximum time for which these actions are repeated; all others are repeated without limit.
+#: Maximum time for which these actions are repeated; others have no limit of their own.
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
     Land: nanoseconds(60.0),  # counted from the last time the proxy reports it in progress
