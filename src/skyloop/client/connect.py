@@ -273,7 +273,7 @@ class PrivateProxy:
         return dial
 
     def close(self) -> None:
-        """Ask the child to end, and wait for at most 4 s if it has to land its vehicle first. Idempotent.
+        """End the child; if it is still landing its vehicle after 4 s, return and let it finish. Idempotent.
 
         A child that never served a client is terminated after 4 s and killed after another 4 s.
         """
