@@ -70,7 +70,7 @@ FEEDBACK: Final = "feedback"
 VIDEO: Final = "video"
 #: The channels and their periods [s], from the paper's experiment (Mellado-Bataller et al., IAS-12, 2013).
 PERIODS_S: Final = {COMMAND: 0.03125, FEEDBACK: 0.03125, VIDEO: 0.0667}
-LARGEST: Final = (1920, 1080)  #: Largest frame size [px].
+LARGEST: Final = (1920, 1080)  #: largest frame size [px]
 
 _PACKAGES: Final = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
@@ -205,7 +205,6 @@ class BenchVehicle(Driver):
         return action
 
     def show(self, captured_ns: int, image: Image) -> None:
-        """Publish a frame."""
         if (sink := self._sink) is not None:
             height, width, _ = image.shape
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
@@ -217,7 +216,6 @@ class BenchVehicle(Driver):
 
 
 def proxy_name(folder: str) -> str:
-    """Return the name of the proxy to measure."""
     return Path(folder).name.lower()
 
 
@@ -233,12 +231,10 @@ class Vehicle:
         self._proxy.start()
 
     def _server(self, folder: str) -> tuple[str, TransportServer]:
-        """Return the proxy's name and its transport server."""
         name = proxy_name(folder)
         return name, LocalServer(name)
 
     def feedback(self, sent_ns: int) -> None:
-        """Send feedback."""
         self._vehicle.publish_feedback(sent_ns)
 
     def frame(self, sent_ns: int, image: Image) -> None:
@@ -246,7 +242,6 @@ class Vehicle:
         self._vehicle.show(sent_ns, image)
 
     def close(self) -> None:
-        """Close the proxy."""
         self._proxy.end()
 
 
@@ -258,17 +253,14 @@ class Listening:
         self._known_ns = 0
 
     def feedback(self, feedback: Feedback) -> None:
-        """Report new feedback."""
         if feedback.captured_ns > self._known_ns:  # when the authority changes hands, the proxy repeats the last state
             self._known_ns = feedback.captured_ns
             self._received(FEEDBACK, feedback.captured_ns)
 
     def frame(self, frame: Frame) -> None:
-        """Report a frame."""
         self._received(VIDEO, frame.captured_ns)
 
     def picture(self, picture: EncodedFrame) -> None:
-        """Report an encoded frame."""
         self._received(VIDEO, picture.captured_ns)
 
 
@@ -289,19 +281,17 @@ class Application:
         return connect(proxy_name(folder), name="bench", on_exit="hover")
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:
-        """Send a set-point."""
         forward, left, yaw_rate = setpoint
         self._drone.velocity(forward=forward, left=left, up=stamped(sent_ns), yaw_rate=yaw_rate)
 
     def close(self) -> None:
-        """Close the drone."""
         self._drone.close()
 
 
 # The bare connection ------------------------------------------------------------------------------------------------
 
 _STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
-_PACKET: Final = struct.Struct("<qqq3d52x")  # the same with a size of zero, and three numbers: 100 bytes, as in Skyloop
+_PACKET: Final = struct.Struct("<qqq3d52x")  # a stamp of size 0, three numbers, and padding to 100 bytes as in Skyloop
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
@@ -598,7 +588,7 @@ FLEETS: Final = (
     Fleet("empty", 100, "crazyflie"),
 )
 SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 is the cameras' own size, 2 is twice as wide
-CAMERAS_AT_ONCE: Final = 10
+CAMERAS_AT_ONCE: Final = 10  #: number of drones that see each other, each with its front camera
 DRAWING_WORLD: Final = "room"  #: a furnished room with markers and a moving board
 FRAMES_PER_S: Final = 30.0  #: frame rate of each camera; the drones fly for one period between images
 #: Number of steps per batch: a multiple of all periods, which makes every batch do the same work.
@@ -744,10 +734,10 @@ class Flight:
 
 
 class _Hops:
-    """Firmware that makes a drone hop. It reads all sensors but computes nothing from them."""
+    """Firmware that makes a drone hop. Simulating all sensors for it takes time; its own computation does not."""
 
     def exchange(self, readings: Readings) -> tuple[float, ...]:
-        """Return full thrust near the ground and zero thrust above."""
+        """Return high rotor commands near the ground and low ones above 0.5 m."""
         thrust = 0.6 if (readings.range_m or 0.0) < 0.5 else 0.2
         return (thrust,) * 4
 

@@ -15,7 +15,7 @@ from skyloop.messages import Intrinsics
 MAX_BYTES: Final = 1 << 20  #: maximum size of a file [bytes]; a calibration takes less than 1000
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
-_LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
+_LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}  # allowed numbers of distortion coefficients, by model
 _SAME_SHAPE = 0.01  # tolerance for comparing aspect ratios; the sizes of small images are rounded
 
 

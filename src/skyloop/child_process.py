@@ -24,7 +24,7 @@ from skyloop.platform import own_session, read_tail
 
 GRACE_S: Final = 4.0  #: time limit for a child to exit on request, and again after it is terminated
 _TAIL: Final = 2000  # bytes of a child's standard error that an error message shows
-_LOOK_S: Final = 0.25  # how often to check a child that may hang silently
+_CHECK_S: Final = 0.25  # how often to check a child that may hang silently
 #: Time limit for reading a dead child's output, because a grandchild may keep the pipe open.
 _DRAIN_S: Final = 1.0
 #: Variable that passes data to a child. Only its user can read its environment, but all users can read command lines.
@@ -64,7 +64,7 @@ if hasattr(os, "register_at_fork"):  # without fork, a child inherits nothing
 
 
 class ChildProcess:
-    """A child process in its own session: Ctrl-C in the terminal reaches only the parent. Any thread."""
+    """A child process in its own session: Ctrl-C in the terminal reaches only the parent. Thread-safe."""
 
     def __init__(
         self,
@@ -113,7 +113,7 @@ class ChildProcess:
 
     @property
     def stderr_tail(self) -> str:
-        """Return the end of the child's standard error."""
+        """The end of the child's standard error."""
         if self._errors is None or self._errors.closed:
             return self._stderr_tail
         return read_tail(self._errors.fileno(), _TAIL).decode(errors="replace").strip()
@@ -126,7 +126,7 @@ class ChildProcess:
 
     @property
     def quoted_output(self) -> str:
-        """Return the end of the child's standard error, formatted to follow a message; empty if there is none."""
+        """The end of the child's standard error, formatted to follow a message; empty if there is none."""
         text = self.stderr_tail
         return f"; its output:\n{text}" if text else ""
 
@@ -200,12 +200,12 @@ def interrupt_deferred() -> Iterator[threading.Event]:
 
 
 def handed_over() -> str | None:
-    """Return the data that the parent passed outside the command line, on the first call only; None without data."""
+    """Return the data that the parent passed outside the command line; None if there is none, or on later calls."""
     return os.environ.pop(_HANDED, None)
 
 
 class RestartingChild:
-    """Keeps one child running until :meth:`stop`, restarting it whenever it ends. Any thread.
+    """Keeps one child running until :meth:`stop`, restarting it whenever it ends. Thread-safe.
 
     All decisions are made under one lock: no child starts after :meth:`request_stop`, and every child is ended.
     """
@@ -321,7 +321,7 @@ class RestartingChild:
 
     def _wait(self, child: ChildProcess) -> str:
         """Wait until a child has ended and its output has been read; return how it ended, as readable text."""
-        while child.wait(None if self._silent is None else _LOOK_S) is None:
+        while child.wait(None if self._silent is None else _CHECK_S) is None:
             if self._silent is not None and self._silent():
                 child.kill()
         reader = self._reader

@@ -32,7 +32,7 @@ from typing import Final, Self
 
 
 def shortened(text: str, most: int) -> str:
-    """Shorten a text to ``most`` characters; keep its beginning and end, because either may contain the cause.
+    """Shorten text to ``most`` characters; keep its beginning and end, because either may contain the cause.
 
     Characters that can't be encoded as UTF-8, for example in invalid file names, become question marks.
     """
@@ -54,7 +54,7 @@ class Hint(StrEnum):
 
 
 _IN_PYTHON: Final = {
-    Hint.SEARCH_NETWORK: ("only this host was searched (use network=True, or set SKYLOOP_NETWORK, to search further)"),
+    Hint.SEARCH_NETWORK: "only this host was searched (use network=True, or set SKYLOOP_NETWORK, to search further)",
     Hint.NAME_NETWORK: "also give network=True, or set SKYLOOP_NETWORK",
     Hint.REACH_BY_NETWORK: "programs may reach it over the network (network=True)",
     Hint.OBSERVE: 'connect with access="observe" to watch meanwhile',
@@ -144,7 +144,6 @@ class MissingExtraError(SkyloopError, ImportError):
     """
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
-        """Compose the message."""
         self.what = what
         self.extra = extra
         self.cause = cause

@@ -19,8 +19,8 @@ Array = NDArray[np.float64]
 def drift(dt_s: float, intensity: float, axes: int = 1) -> tuple[Array, Array]:
     """Return the transition and the process noise over ``dt_s`` for positions, then velocities; each (2·axes, 2·axes).
 
-    The model is continuous white-noise acceleration (section 6.2.2): two predictions equal one prediction over the
-    total time, and within a second the velocity varies by the square root of ``intensity``.
+    The model is continuous white-noise acceleration (section 6.2.2): two successive predictions equal one over the
+    total time, and the standard deviation of the velocity after a second is the square root of ``intensity``.
     """
     move = np.eye(2 * axes) + np.eye(2 * axes, k=axes) * dt_s
     wander = np.array([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]]) * intensity

@@ -45,7 +45,7 @@ class Known:
     @property
     def is_far(self) -> bool:
         """Whether frames arrive over a network, in the encoding that each consumer requests."""
-        return self._drone._connection.variants
+        return self._drone._connection.adapts_frames
 
     @property
     def listeners(self) -> list[Listener[Any]]:
@@ -68,7 +68,7 @@ class Commands(Protocol):
     @property
     def wants_flight(self) -> bool: ...  #: whether the newest set-point keeps the vehicle in the air or brings it there
     @property
-    def may_ask(self) -> bool: ...  #: whether a connection exists on which this application holds the authority
+    def may_ask(self) -> bool: ...  #: whether a proxy is connected and this application holds the authority
     @property
     def newest_outcome(self) -> Outcome | None: ...  #: the proxy's newest report about these intents
 
@@ -95,19 +95,13 @@ def ask(drone: Drone, action: AnyAction) -> int:
 
 
 def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = False) -> bool:
-    """Hover or land because the library, and not a person, has decided to do so. Never raises.
+    """Hover or land because the library, rather than a person, has decided to do so. Never raises.
 
     Does nothing if someone else flies the vehicle, if it is landing or returning, or if the application itself landed
     or stopped it. A take-off without visible effect is cancelled. Without the authority, only the set-point is dropped.
 
-    Args:
-        drone: The drone.
-        reason: Why the library gives up control, for the log.
-        land: Whether to land rather than hover.
-        for_good: Whether later commands of the application, except for an emergency stop, raise :class:`ClosedError`.
-
-    Returns:
-        Whether anything was sent.
+    ``land``: whether to land rather than hover. ``for_good``: whether later commands of the application, except for an
+    emergency stop, raise :class:`ClosedError`. Returns whether anything was sent; the log states the ``reason``.
     """
     if for_good:
         drone._commands.bar()
@@ -117,15 +111,8 @@ def let_go(drone: Drone, reason: str, *, land: bool = False, for_good: bool = Fa
 def open_unasked(kind: type[D], dial: Dialer, *, app: str, timeout_s: float, **options: Unpack[DroneOptions]) -> D:
     """Connect as a pilot without requesting the authority yet. Waits for the first feedback.
 
-    Args:
-        kind: ``Drone``, or a subclass of it.
-        dial: Connects to the proxy, both now and again after each loss.
-        app: Name of this application, 1 to 64 characters.
-        timeout_s: Time limit for the proxy to answer and to send feedback [s].
-        **options: See :class:`skyloop.client.drone.DroneOptions`.
-
-    Raises:
-        SkyloopError: The same errors as for :func:`skyloop.connect`.
+    ``kind`` is ``Drone`` or a subclass, and ``app`` the application's name (1 to 64 characters). ``timeout_s`` limits
+    the wait for the proxy to answer and to send feedback. Raises the same errors as :func:`skyloop.connect`.
     """
     drone = kind(dial, app=app, **options)
     drone._connect(timeout_s=timeout_s, acquire=False)
@@ -157,17 +144,7 @@ def video_channel(
 ) -> VideoChannel:
     """Return the channel of a camera's frames; the channel calls its consumers on the receiving thread.
 
-    Args:
-        drone: The drone.
-        camera: Name of the camera; None: the vehicle's first camera.
-        max_fps: Maximum number of frames per second; None: no limit.
-        part: (k, n): only every n-th frame, starting with frame k; None: all frames.
-
-    Raises:
-        UnknownNameError: If the vehicle has no camera of this name.
-        UnsupportedError: If the vehicle has no camera.
-        UsageError: If an option is out of range.
-        ClosedError: If the drone was closed.
+    Arguments and errors are those of :meth:`skyloop.Drone.frames`.
     """
     return drone._state.video.channel(camera, max_fps=max_fps, part=part)
 
@@ -208,7 +185,7 @@ def join_processor(
     """Become a worker of a processor, as ``skyloop process`` does, until the drone is closed. Waits for an answer.
 
     Args:
-        drone: The drone.
+        drone: The drone whose frames the worker processes.
         name: Name of the processor.
         code: Identifies the code, which must be the same for all workers with this name; at most 128 characters.
         camera: Name of the camera; None: the vehicle's first.

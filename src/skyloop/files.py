@@ -13,6 +13,9 @@ import msgspec
 
 from skyloop.errors import FileFormatError, UsageError
 
+if TYPE_CHECKING:
+    pass
+
 T = TypeVar("T")
 
 MAX_TEXT: Final = 1 << 20  #: maximum size of a hand-written list [bytes]
@@ -57,7 +60,7 @@ def read_json(path: str | Path, kind: type[T], what: str, most: int) -> T:
 
 
 def expand(path: str | Path) -> Path:
-    """Expand ``~`` to the home directory; return a path with an unknown user unchanged, which won't be found."""
+    """Expand ``~`` to the home directory; leave the path of an unknown user unchanged, so that it won't be found."""
     try:
         return Path(path).expanduser()
     except RuntimeError:

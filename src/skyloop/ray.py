@@ -18,7 +18,7 @@ from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopE
 from skyloop.processing import Code, Settings, Status, Worker, load_processor
 
 _ASK_S: Final = 10.0  #: time limit for an actor to return its status
-_LOOK_S: Final = 0.1  # how often to check whether all actors have started
+_CHECK_S: Final = 0.1  # how often to check whether all actors have started
 _START_S: Final = 60.0  #: time limit for Ray to place and start all actors
 #: Environment variables of this program that a worker needs to find the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
@@ -28,7 +28,6 @@ class Workers:
     """The actors of one processor, created by :func:`process`. It is a context manager, which ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
-        """Store Ray's handles for the actors."""
         self.actors = actors  #: Ray's handles for the actors
 
     def statuses(self, timeout_s: float = _ASK_S) -> list[Status | None]:
@@ -38,7 +37,7 @@ class Workers:
             timeout_s: Maximum time to wait for all actors [s].
 
         Raises:
-            LinkError: If an actor can't continue, for example because other code took its name; the message says why.
+            LinkError: If an actor can't continue, for example because other code took its name.
         """
         ray = _ray()
         asked = [actor.status.remote() for actor in self.actors]
@@ -132,7 +131,7 @@ def _runtime_env(wanted: Any) -> dict[str, Any]:
     variables = wanted.get("env_vars") or {} if isinstance(wanted, Mapping) else None
     if not isinstance(variables, Mapping):
         raise UsageError(
-            f"runtime_env is {wanted!r} and must be a dict as Ray takes it, with env_vars, if any, as a dict"
+            f"runtime_env is {wanted!r} and must be a dict that Ray accepts; env_vars, if given, must be a dict, too"
         )
     ours = {key: os.environ[key] for key in _ENVIRONMENT if key in os.environ}
     return {**wanted, "env_vars": {**ours, **variables}}
@@ -143,7 +142,7 @@ def _await_start(workers: Workers) -> None:
     while (left_s := deadline - time.monotonic()) > 0.0:
         if all(status is not None for status in workers.statuses(left_s)):
             return
-        time.sleep(_LOOK_S)
+        time.sleep(_CHECK_S)
     raise NoAnswerError(
         f"Ray did not start {len(workers.actors)} actors within {_START_S:g} s: does it have that many CPUs free?"
     )

@@ -30,7 +30,7 @@ _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
 _WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # how a msgspec error ends
 _STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
-_KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a text", list: "a list", dict: "a table"}
+_KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a string", list: "a list", dict: "a table"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +143,7 @@ def _tables(info: inspect.Type) -> list[inspect.StructType]:
 
 
 def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
-    """Return each key's type and whether it is required; of several kinds, use the one that the table names."""
+    """Return each key's type and whether it is required; if several kinds are possible, the table names its kind."""
     kinds = _tables(info)
     tag = kinds[0].tag_field
     fields: dict[str, tuple[inspect.Type, bool]] = {}
@@ -168,7 +168,7 @@ def _wanted(info: inspect.Type, place: Place) -> str:
     if isinstance(plain, inspect.BoolType):
         return "true or false"
     if isinstance(plain, inspect.StrType):
-        return "a text that is not empty" if plain.min_length else "a text"
+        return "a non-empty string" if plain.min_length else "a string"
     if isinstance(plain, inspect.FloatType):
         return _range(plain.ge, plain.le)
     if isinstance(plain, inspect.TupleType):
@@ -177,13 +177,13 @@ def _wanted(info: inspect.Type, place: Place) -> str:
         if _tables(plain.item_type):
             return f"tables written [[{place.table}]]"
         if isinstance(_plain(plain.item_type), inspect.StrType):
-            return "a list of texts"
+            return "a list of strings"
         return f"a list of at least {plain.min_length} lists of {len(_plain(plain.item_type).item_types)} numbers"
     return "one of " + ", ".join(_choices(info)) if _choices(info) else f"a table [{place.table}]"
 
 
 def _range(low: float | None, high: float | None) -> str:
-    """Describe a number between these bounds; an upper bound equal to the largest float is left out."""
+    """Describe a number between these bounds; bounds equal to the largest float are omitted."""
     least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
     if least and most:
         return f"a number from {low:g} to {high:g}"

@@ -15,7 +15,7 @@ from skyloop.errors import ParameterError
 from skyloop.messages import Refusal, Value
 
 FAR_M: Final = 10_000.0  #: a wall of the safety box is ignored if it is at least this far away [m]
-MAX_ZONES: Final = 32
+MAX_ZONES: Final = 32  #: maximum number of zones
 #: Thinner zones are enlarged to this thickness [m] to keep an overshoot or a gust from carrying a vehicle across.
 THINNEST_M: Final = 0.5
 BOX: Final = "safety.box"  #: prefix of the parameters of the safety box
@@ -23,14 +23,14 @@ ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
 MAX_NAME: Final = 24  #: maximum length of a zone's name [characters]
-_SHAPES: Final = {"box": 6, "cylinder": 5}
+_SHAPES: Final = {"box": 6, "cylinder": 5}  # how many numbers define each shape
 _NAME: Final = re.compile(rf"[^:;,\x00-\x1f\x7f]{{1,{MAX_NAME}}}")
 
 Vec3 = tuple[float, float, float]
 
 
 class Wall(NamedTuple):
-    """A plane, given by the unit vector towards it in world axes and by its distance [m]; negative beyond the plane."""
+    """A plane, given by a unit vector towards it (world axes) and the distance to it [m], negative beyond the plane."""
 
     normal: Vec3
     distance: float
@@ -214,7 +214,7 @@ def parse_zones(text: str) -> tuple[Zone, ...]:
     """
     zones = [_parse_zone(part) for part in text.split(";") if part.strip()]
     if len(zones) > MAX_ZONES:
-        raise _wrong(f"{len(zones)} zones were given, at most {MAX_ZONES} are possible")
+        raise _wrong(f"{len(zones)} zones were given, at most {MAX_ZONES} are allowed")
     return tuple(zones)
 
 
@@ -279,7 +279,10 @@ def _wrong(why: str) -> ParameterError:
 
 
 def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
-    """Return the part of the segment from ``at`` to ``to`` between two walls, limited to ``first`` to ``last``."""
+    """Return the part of the way from ``at`` to ``to`` between two walls, as fractions from ``first`` to ``last``.
+
+    If there is none, the first fraction is greater than the second.
+    """
     if at == to:
         return (first, last) if low <= at <= high else (1.0, 0.0)
     one, other = (low - at) / (to - at), (high - at) / (to - at)

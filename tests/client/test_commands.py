@@ -441,7 +441,7 @@ def test_a_page_not_known_to_be_present_sends_no_flying_commands(proxy: Scripted
     at = proxy.commands[-1].seq
     assert not drone.velocity(forward=0.2)
     assert not drone.command(Takeoff())
-    with pytest.raises(AuthorityError, match="takeoff was not sent: the person who flies is not known to be present"):
+    with pytest.raises(AuthorityError, match="takeoff was not sent: the person flying is not known to be present"):
         drone.takeoff(wait=False)
     assert extend.let_go(drone, "the page is gone"), "a command that ends a flight is still sent"
     proxy.until_commanded(Hover())

@@ -238,7 +238,7 @@ def test_callbacks_follow_a_proxy_that_restarts_with_another_camera(
         assert drone._state.video.streams[stream].consumed
     for listener in listeners:
         listener.cancel()
-    assert not any(channel.consumed for channel in drone._state.video.variants.values())
+    assert not any(channel.consumed for channel in drone._state.video.by_topic.values())
     assert not any(channel.consumed for channel in drone._state.video.streams.values())
     assert not drone._state.on_welcome.consumed
 

@@ -548,11 +548,11 @@ def test_unread_channels_are_forgotten(proxy: ScriptedProxy, drone: Drone) -> No
             state.feedback_channel(FeedbackRequest(max_hz=1.0 + number / 10))
         assert drone._state.video.channel(scale=0.5) is watched
         assert {id(channel) for channel in state.video.channels.values()} <= {
-            id(one) for one in state.video.variants.values()
+            id(one) for one in state.video.by_topic.values()
         }
         assert 1.0 < len(state.selected) <= IDLE_KEPT
         assert any(channel.subscribed for channel in state.selected)
-    assert len(state.video.variants) <= IDLE_KEPT
+    assert len(state.video.by_topic) <= IDLE_KEPT
     assert len(state.video.streams) <= IDLE_KEPT
 
 

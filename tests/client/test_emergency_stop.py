@@ -107,7 +107,7 @@ def test_commands_blocked_by_a_stop_are_reported(proxy: ScriptedProxy, drone: Dr
         lambda: drone.land(wait=False),
     ]
     for once in calls:
-        with pytest.raises(RefusedError, match="emergency stop of this application has not shown") as error:
+        with pytest.raises(RefusedError, match="emergency stop is not confirmed yet") as error:
             once()
         assert error.value.code == "wrong_state"
     assert drone.emergency_stop(), "another press counts"

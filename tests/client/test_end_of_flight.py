@@ -365,7 +365,7 @@ def test_a_vehicle_flown_by_others_is_left_to_them_at_the_end(
     steps: list[str] = []
     assert drone._piloting.end_flight(steps.append) is None
     assert steps == [told]
-    assert ("not landed from here" in caplog.text) == ("RTL" in told)
+    assert ("not landing it" in caplog.text) == ("RTL" in told)
     assert {action.name for action in proxy.actions()} <= {"idle"}
 
 

@@ -59,8 +59,8 @@ def test_entries_are_sent(proxy: ScriptedProxy, drone: Drone) -> None:
 @pytest.mark.parametrize(
     ("call", "match"),
     [
-        (lambda log: log.text(7), "texts of at most 4096"),
-        (lambda log: log.text("x" * (MAX_LOG_TEXT + 1)), "texts of at most 4096"),
+        (lambda log: log.text(7), "strings of at most 4096"),
+        (lambda log: log.text("x" * (MAX_LOG_TEXT + 1)), "strings of at most 4096"),
         (lambda log: log.text("x", severity="fatal"), "info, warning, error"),
         (lambda log: log.text("x", name="n" * 65), "1 to 64"),
         (lambda log: log.text("x", name=None), "1 to 64"),

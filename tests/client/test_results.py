@@ -140,7 +140,7 @@ def test_listeners(proxy: ScriptedProxy, drone: Drone) -> None:
     one.cancel()
     many.cancel()
     until_subscribed(proxy, drone, RESULTS, 0)
-    with pytest.raises(UsageError, match="at least 1 result"):
+    with pytest.raises(UsageError, match="depth is 0 and must be at least 1"):
         drone.on_result(print, "detector", depth=0)
     with pytest.raises(UsageError, match="can't be called"):
         drone.on_result(7)  # type: ignore[arg-type]

@@ -105,7 +105,7 @@ def test_a_stop_is_sent_at_once_and_steadily_until_it_is_abandoned(shown: bool |
     assert not press.stop.active
     (event,) = press.events
     assert event.data["reason"] == "stop_given_up"
-    assert "has not shown it for 10 s" in event.text
+    assert "has not confirmed it for 10 s" in event.text
 
 
 def test_a_shown_stop_ends_the_sending_and_lasts_until_the_reset() -> None:
@@ -126,7 +126,7 @@ def test_no_reset_before_it_is_shown() -> None:
     for shown in (None, False):
         press.run(TICK_NS, shown)
         assert not press.stop.shown
-        with pytest.raises(DriverError, match="has not shown"):
+        with pytest.raises(DriverError, match="is not confirmed"):
             press.stop.reset()
         assert press.stop.active
     press.run(TICK_NS, shown=True)

@@ -76,7 +76,7 @@ def test_an_empty_file_is_a_host_to_add_vehicles_to() -> None:
         ("name = 'My Host'", ["key 'name'", "lower-case"]),
         (ALPHA + "process = 'owm'", ["'process'", "'owm'", "did you mean 'own'"]),
         (ALPHA + "autostart = 'yes'", ["'autostart'", "'yes'", "true or false"]),
-        (ALPHA + "zones = 'box'", ["'zones'", "a list of texts"]),
+        (ALPHA + "zones = 'box'", ["'zones'", "a list of strings"]),
         (ALPHA + "zones = ['bax 1']", ["vehicle 'alpha'", "'zones'", "bax"]),
         (ALPHA + "limits = {sped = 1.0}", ["vehicle 'alpha'.limits", "'sped'", "did you mean 'speed'"]),
         (ALPHA + "limits = {speed = 99.0}", ["vehicle 'alpha'.limits", "'speed'", "at most 30 m/s"]),

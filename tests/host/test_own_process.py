@@ -65,7 +65,7 @@ def test_a_process_that_keeps_dying_restarts_after_longer_pauses(
 
 def test_a_process_that_stops_reporting_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(own_process, "SILENT_CHECKS", 2)
-    monkeypatch.setattr("skyloop.child_process._LOOK_S", 0.05)
+    monkeypatch.setattr("skyloop.child_process._CHECK_S", 0.05)
     lines: list[str] = []
     hung = vehicle("say(); time.sleep(60)", lines)
     hung.start()

@@ -138,7 +138,7 @@ def test_a_place_on_the_earth(vehicle: str) -> None:
 def test_a_vehicle_that_does_not_know_its_place_on_the_earth_refuses_latitudes() -> None:
     with (
         flown(SIM) as drone,
-        pytest.raises(RefusedError, match="does not report its place on the earth"),
+        pytest.raises(RefusedError, match="does not report its geographic position"),
     ):
         drone.go_to(latitude_deg=47.0, longitude_deg=8.0)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.messages import FeedbackRequest, VideoRequest
-from skyloop.messages.subscription import PLAIN, FrameFilter, RateLimiter
+from skyloop.messages.subscription import EVERY_SAMPLE, FrameFilter, RateLimiter
 from skyloop.transport.base import FEEDBACK, MAX_TOPIC
 
 requests = st.builds(FeedbackRequest, st.none() | st.floats(0.001, 1000.0))
@@ -41,7 +41,7 @@ def test_a_union_covers_both_requests_and_no_more(one: FeedbackRequest, other: F
     both = one.union(other)
     assert both == other.union(one)
     assert both.period_s == min(one.period_s, other.period_s)
-    assert one.union(PLAIN) == PLAIN
+    assert one.union(EVERY_SAMPLE) == EVERY_SAMPLE
 
 
 @pytest.mark.parametrize("max_hz", [0.0, -1.0, math.nan, math.inf, 1001, 1e-300, True, "5"])

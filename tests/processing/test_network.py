@@ -41,7 +41,7 @@ def working(node: Node) -> Iterator[tuple[Drone, Worker]]:
 
 def asked_for(drone: Drone) -> list[tuple[int, int] | None]:
     """Return the subscribed parts of the frames."""
-    return [channel.request.part for channel in drone._state.video.variants.values() if channel.subscribed]
+    return [channel.request.part for channel in drone._state.video.by_topic.values() if channel.subscribed]
 
 
 def test_only_the_frames_of_a_part_travel(node: Node) -> None:

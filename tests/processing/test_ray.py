@@ -200,7 +200,7 @@ def test_a_worker_refused_later_is_reported(ray: FakeRay, monkeypatch: pytest.Mo
 
 def test_no_room_for_the_actors(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(skyloop.ray, "_START_S", 0.05)
-    monkeypatch.setattr(skyloop.ray, "_LOOK_S", 0.01)
+    monkeypatch.setattr(skyloop.ray, "_CHECK_S", 0.01)
     ray.lost = 1000
     with pytest.raises(NoAnswerError, match="did not start 3 actors"):
         skyloop.ray.process(TARGET, drone="alpha", workers=3)

@@ -44,8 +44,7 @@ class Config:
     """
 
     sync: client.Config
-    def __init__(self, sync: client.Config) -> None:
-        """Wrap the parameters of a connected drone."""
+    def __init__(self, sync: client.Config) -> None: ...
     async def get(self, name: str) -> Value:
         """Return the current value. Raises :class:`UnknownNameError`, with suggestions, if the name is unknown.
 
@@ -92,13 +91,12 @@ class Drone:
     Methods have the same names, arguments, results and errors as in :class:`skyloop.Drone`; those that wait are
     coroutines. Callbacks are plain or coroutine functions, and run on the event loop that was running when they were
     added. Image callbacks are the exception: they are plain functions that run in their own threads, because image
-    processing would block the event loop. The function that :meth:`wait` tests feedback with is a plain function, too.
+    processing would block the event loop. The test passed to :meth:`wait` must be a plain function, too.
     """
 
     sync: client.Drone
     config: Config
-    def __init__(self, sync: client.Drone) -> None:
-        """Wrap a connected drone."""
+    def __init__(self, sync: client.Drone) -> None: ...
     async def __aenter__(self) -> Drone: ...
     async def __aexit__(self, *_: object) -> None:
         """This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting."""
@@ -254,7 +252,7 @@ class Drone:
         Args:
             x: Distance east of the origin [m].
             y: Distance north of the origin [m].
-            z: Up [m].
+            z: Height above the origin [m].
             latitude_deg: Latitude [°], north positive; used instead of x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
@@ -285,8 +283,8 @@ class Drone:
 
         If the vehicle is below a safe height, it first climbs straight up, within ``limits.altitude``, the ceiling of
         the room and the top of the safety box. It then flies straight to a point above its start
-        (:attr:`start_position`), as :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends
-        the flight. The vehicle does not avoid obstacles.
+        (:attr:`start_position`), as :meth:`go_to` does, and lands or hovers there. Any other command, another pilot or
+        a failsafe ends the flight. The vehicle does not avoid obstacles.
 
         Args:
             height_m: Minimum height above the start during the flight [m]; None: the parameter ``return.height``.
@@ -376,7 +374,7 @@ class Drone:
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If none arrives in time.
+            NoAnswerError: If no frame arrives in time.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone is closed.
@@ -463,26 +461,22 @@ class Drone:
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly at a velocity given in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
+        See :class:`Drone` for return values and exceptions.
+
         Args:
             forward: Velocity along x, forward [m/s].
             left: Velocity along y, to the left [m/s].
             up: Velocity along z, up [m/s].
             yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Hold an attitude while climbing or descending at a given rate.
+        """Hold an attitude while climbing or descending. See :class:`Drone` for return values and exceptions.
 
         Args:
             roll: Roll [rad]; right side down is positive and accelerates the vehicle to the right.
             pitch: Pitch [rad]; nose down is positive and accelerates the vehicle forward.
             climb: Vertical velocity, up positive [m/s].
-            yaw_rate: Counter-clockwise seen from above [rad/s].
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
+            yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
         """
     def emergency_stop(self) -> bool:
         """Cut the motors immediately: the vehicle falls.
@@ -507,11 +501,7 @@ class Drone:
         If the vehicle has not yet confirmed this application's stop, the reset is sent once it has, within 2 s.
         """
     def command(self, action: AnyAction) -> bool:
-        """Make ``action`` the newest set-point.
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
-        """
+        """Make ``action`` the newest set-point. See :class:`Drone` for return values and exceptions."""
     def send_external_pose(
         self,
         position: Vector,
@@ -581,13 +571,11 @@ class Drone:
             UsageError: If ``max_hz`` is out of range.
         """
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
-        """Return the newest frame without waiting.
-
-        The first call subscribes to the camera permanently.
+        """Return the newest frame without waiting. The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first camera.
-            max_age_s: Maximum age since capture [s]; None: any.
+            max_age_s: Maximum age since capture [s]; None: no limit.
 
         Returns:
             The frame; None if no frame has arrived yet, or if it is too old or can't be decoded.
@@ -598,9 +586,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
     def result(self, processor: str, *, max_age_s: float | None = None) -> Result | None:
-        """Return a processor's newest result without waiting.
-
-        The first call subscribes to the processor permanently.
+        """Return a processor's newest result without waiting. The first call subscribes to the processor permanently.
 
         Args:
             processor: Name of the processor.
@@ -625,7 +611,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest frames it has not seen; up to ``depth`` frames wait.
+            function: Called in its own thread with frames that it has not seen yet.
             camera: Name of the camera; None: the vehicle's first camera, whichever it is after a restart.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Whether to call it on the receiving thread instead, with every frame. It must be quick and not wait.
@@ -693,7 +679,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving thread.
+        It runs on the event loop.
         """
     def on_feedback(
         self,
@@ -737,7 +723,7 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop or, with ``inline``, on the receiving thread.
+        It runs on the event loop.
         """
     def on_annotation(
         self, function: Callable[[Annotation], object | Awaitable[object]], *, inline: bool = False
@@ -746,14 +732,14 @@ class Drone:
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop.
+        It runs on the event loop.
         """
     def on_log(self, function: Callable[[LogEntry], object | Awaitable[object]], *, inline: bool = False) -> Listener:
         """Call ``function`` with all applications' log entries (``drone.log``), including our own; up to 256 wait.
 
         ``function``, plain or a coroutine function, runs on the event loop; ``inline`` must be False.
 
-        It is called on the event loop.
+        It runs on the event loop.
         """
     def on_result(
         self,
@@ -785,8 +771,7 @@ class Listener:
     """A callback that runs on the event loop; its calls never overlap."""
 
     sync: client.Listener[Any]
-    def __init__(self, sync: client.Listener[Any]) -> None:
-        """Wrap a listener whose function hands samples to the event loop."""
+    def __init__(self, sync: client.Listener[Any]) -> None: ...
     def cancel(self) -> None:
         """Stop calling the function. Does not wait for a running call."""
     @property
@@ -808,8 +793,7 @@ class Swarm:
     """
 
     sync: client.Swarm
-    def __init__(self, sync: client.Swarm) -> None:
-        """Wrap a connected swarm."""
+    def __init__(self, sync: client.Swarm) -> None: ...
     async def __aenter__(self) -> Swarm: ...
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -824,9 +808,10 @@ class Swarm:
     def __iter__(self) -> Iterator[Drone]: ...
     def __repr__(self) -> str: ...
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` for all active drones concurrently on this event loop. Cancelling it cancels all of them.
+        """Await ``function`` for all active drones concurrently on this event loop.
 
-        A coroutine function. Exceptions, ``what`` and the result work as in :meth:`skyloop.Swarm.each`.
+        Cancelling this coroutine cancels all of its calls. Exceptions, ``what`` and the result work as in
+        :meth:`skyloop.Swarm.each`.
         """
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
         """Yield at a steady rate with absolute deadlines, for a loop that commands all drones.
@@ -967,8 +952,7 @@ class Swarm:
 
         This is a coroutine, which waits in its own thread. Cancelling the task ends the waiting.
 
-        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see
-        :meth:`hover`). :attr:`spread` is the time between the first and the last command.
+        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see :meth:`hover`).
 
         Args:
             actions: Actions by drone name.
@@ -978,7 +962,7 @@ class Swarm:
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
-            UsageError: If an action can't be commanded or contains numbers that are not finite; nothing is sent then.
+            UsageError: If an action can't be commanded or has a number that is not finite; nothing is sent.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -1052,7 +1036,7 @@ class Swarm:
         """
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of the last :meth:`send` [s]; None before the first call."""
+        """Times between the first and the last command of each :meth:`send` [s], over the last 1024; None if none."""
     def __len__(self) -> int: ...
     def __contains__(self, name: object) -> bool: ...
 

@@ -91,8 +91,7 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
     try:
         return await future
     except asyncio.CancelledError:
-        # The call was cancelled in the same iteration of the event loop in which the result arrived: nobody else
-        # receives the result.
+        # If the result arrived in the same iteration of the event loop as the cancellation, settle() did not see it.
         if future.done() and not future.cancelled() and future.exception() is None and abandoned is not None:
             threading.Thread(target=abandoned, args=(future.result(),), daemon=True).start()
         raise
@@ -116,7 +115,7 @@ def from_thread(function: Callback[T]) -> Callable[[T], Any]:
 
 
 def mirrors(kind: type, rows: Mapping[Callable[[Any], Any], str]) -> Callable[[type[T]], type[T]]:
-    """Decorate an asyncio class with members of ``kind``; ``rows`` maps each way of making a member to the names."""
+    """Decorate an asyncio class with members of ``kind``; ``rows`` maps each wrapper to the names of its members."""
 
     def fill(face: type[T]) -> type[T]:
         for way, names in rows.items():
@@ -150,10 +149,10 @@ def on_loop(member: Any) -> Any:
     @wraps(plain)
     def call(self: Any, function: Any, *args: Any, **given: Any) -> Any:
         if given.get("inline"):
-            raise UsageError(f"{member.__name__}: inline must be False, as the function runs on the event loop")
+            raise UsageError(f"{member.__name__}: inline must be False, because the function runs on the event loop")
         return Listener(plain(self, from_thread(function) if callable(function) else function, *args, **given))
 
-    where = r"in its own thread( or, with ``inline``, on the receiving one)?"
+    where = r"in its own thread( or, with ``inline``, on the receiving thread)?"
     call.__doc__ = re.sub(where, "on the event loop", call.__doc__ or "")
     signature = inspect.signature(member)
     takes = signature.parameters["function"].annotation
@@ -227,7 +226,6 @@ class Config:
     sync: client.Config  #: wrapped parameters
 
     def __init__(self, sync: client.Config) -> None:
-        """Wrap the parameters of a connected drone."""
         self.sync = sync
 
     get = awaited(client.Config.__getitem__)
@@ -241,7 +239,6 @@ class Listener:
     sync: client.Listener[Any]  #: wrapped listener; its thread waits for each call
 
     def __init__(self, sync: client.Listener[Any]) -> None:
-        """Wrap a listener whose function hands samples to the event loop."""
         self.sync = sync
 
     def cancel(self) -> None:
@@ -277,14 +274,13 @@ class Drone:
     Methods have the same names, arguments, results and errors as in :class:`skyloop.Drone`; those that wait are
     coroutines. Callbacks are plain or coroutine functions, and run on the event loop that was running when they were
     added. Image callbacks are the exception: they are plain functions that run in their own threads, because image
-    processing would block the event loop. The function that :meth:`wait` tests feedback with is a plain function, too.
+    processing would block the event loop. The test passed to :meth:`wait` must be a plain function, too.
     """
 
     sync: client.Drone  #: wrapped drone
     config: Config  #: parameters of the vehicle and of the proxy
 
     def __init__(self, sync: client.Drone) -> None:
-        """Wrap a connected drone."""
         self.sync = sync
         self.config = Config(sync.config)
 
@@ -358,7 +354,6 @@ class Swarm:
     sync: client.Swarm  #: wrapped swarm
 
     def __init__(self, sync: client.Swarm) -> None:
-        """Wrap a connected swarm."""
         self.sync = sync
         self._drones = {name: Drone(drone) for name, drone in sync.items()}
 
@@ -387,9 +382,10 @@ class Swarm:
         return f"<aio.{repr(self.sync)[1:]}"
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
-        """Await ``function`` for all active drones concurrently on this event loop. Cancelling it cancels all of them.
+        """Await ``function`` for all active drones concurrently on this event loop.
 
-        A coroutine function. Exceptions, ``what`` and the result work as in :meth:`skyloop.Swarm.each`.
+        Cancelling this coroutine cancels all of its calls. Exceptions, ``what`` and the result work as in
+        :meth:`skyloop.Swarm.each`.
         """
         loop = asyncio.get_running_loop()
         ours = {id(drone.sync): drone for drone in self}
@@ -408,7 +404,7 @@ class Swarm:
 
         try:
             return await in_thread(lambda: self.sync.each(wait_for, what or getattr(function, "__name__", "each")))
-        finally:  # after a cancellation, they must not keep commanding and conflict with the next commands
+        finally:  # after a cancellation, the tasks must not keep sending commands that conflict with later ones
             over = True
             for task in running:
                 task.cancel()

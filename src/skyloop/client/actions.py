@@ -61,6 +61,7 @@ _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     EmergencyStop: nanoseconds(0.1),
     ResetEmergency: nanoseconds(0.1),
 }
+#: Maximum time for which these actions are repeated; others have no limit of their own.
 _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(21.0),  # the proxy gives up after 20 s and reports whether the take-off may be requested again
     Land: nanoseconds(60.0),  # counted from the last time the proxy reports it in progress
@@ -142,7 +143,7 @@ def in_world_axes(
     origin = None if newest is None else newest.origin
     if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
         raise RefusedError(
-            "position: the vehicle does not report its place on the earth (it needs a 3-D satellite fix, and a "
+            "position: the vehicle does not report its geographic position (this needs a 3-D satellite fix and a "
             "driver that reports it): use x, y, z",
             code=Refusal.WRONG_STATE,
         )
@@ -175,7 +176,8 @@ def number(name: str, value: object) -> float:
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
     """Return whether a vehicle is in the air at a target, and nearly at rest.
 
-    The yaw is checked if the target has one; a vehicle that doesn't report its velocity is assumed to be at rest.
+    The yaw is checked if the target has one. A vehicle that doesn't report its state is assumed to be in the air, and
+    one that doesn't report its velocity to be at rest.
     """
     if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False
@@ -213,10 +215,10 @@ class CommandSchedule:
     """Stores the newest set-point of an application and decides when to send it. Times are on this process's clock."""
 
     def __init__(self, *, rate_hz: float = 32.0, stall_s: float = 1.0) -> None:
-        """Start without a set-point; repeat later ones at 1 to 200 Hz. Raises :class:`UsageError` for invalid values.
+        """Start without a set-point. Raises :class:`UsageError` unless ``rate_hz`` is 1 to 200 and ``stall_s`` above 0.
 
         If the application makes no call for ``stall_s``, a velocity or attitude decays to hover; ``math.inf`` disables
-        this. Flights to a target and return flights do not decay: the vehicle stops there.
+        this. Flights to a target and return flights do not decay, because the vehicle stops at the end of them.
         """
         if not 1.0 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
@@ -248,7 +250,7 @@ class CommandSchedule:
         resets = isinstance(action, ResetEmergency)
         self._reset_asked_ns = now_ns if resets and self.stopping else None
         if self._reset_asked_ns is not None:
-            return self.intent
+            return self.intent  # observe() requests the reset once the vehicle reports the stop
         stops = type(action) is Hover and type(self.action) is not Hover
         self.action, self.over = action, None
         self.intent += 1
@@ -307,7 +309,7 @@ class CommandSchedule:
         return self.action
 
     def not_sent(self, action: AnyAction, now_ns: int) -> None:
-        """Record that the action from :meth:`next` was not sent. A new set-point replaces it, except a landing."""
+        """Record that the action from :meth:`next` was not sent; a one-off action remains :attr:`owed`."""
         if isinstance(action, EmergencyStop):
             if self._new_sent_ns == now_ns:  # first attempt: the action may still be withdrawn, and is soon abandoned
                 self._sent_intent = -1
@@ -317,7 +319,7 @@ class CommandSchedule:
     def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
         """Return :attr:`owed` if it must be sent before ``action``, because ``action`` neither repeats nor revokes it.
 
-        Actions requested by the library itself revoke everything except a landing.
+        One-off actions revoke it; actions requested by the library itself revoke everything except a landing.
         """
         owed = self.owed
         if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > _KEEP_NS:
@@ -368,7 +370,7 @@ class CommandSchedule:
 
     def resume(self, now_ns: int, connected_ns: int = 0) -> None:
         """Resume sending on the connection made at ``connected_ns``, but drop a set-point that is too old."""
-        if now_ns - self._asked_ns > _KEEP_NS:  # the connection is still the same; only the lease was missing
+        if now_ns - self._asked_ns > _KEEP_NS:  # if it was requested on this connection, only the lease was missing
             self.clear(Fate.LINK if self._asked_ns < connected_ns else Fate.AUTHORITY)
         self._failsafe = Failsafe.NONE
         self.due_ns = now_ns

@@ -139,7 +139,7 @@ class AuthorityTracker:
 
     @property
     def behind_itself(self) -> bool:
-        """Whether it is queued only until the proxy notices that an earlier session of this process has ended."""
+        """Whether the application is queued only until the proxy notices the end of this process's earlier session."""
         return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
 
     @property
@@ -189,12 +189,11 @@ class AuthorityTracker:
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
 
     def given_back(self) -> bool:
-        """Record that the application has released it, or that the proxy has refused it."""
+        """Record that the application released the authority, or that the proxy refused it or let it expire."""
         self.wanted = self.pending = False
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
     def event(self, event: Event, now_ns: int) -> bool:
-        """Update from an event."""
         data = event.data
         ours = data.get("app_id") == self.app_id
         if event.kind is EventKind.AUTHORITY_GRANTED and ours:

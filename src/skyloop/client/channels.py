@@ -33,7 +33,7 @@ class Emit(Protocol):
 
 
 JOIN_S: Final = 2.0  #: how long cancelling waits for a call in progress [s]
-_REPORT_EVERY_S: Final = 1.0
+_REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of one listener's errors
 _log = logging.getLogger("skyloop")
 
 
@@ -88,7 +88,6 @@ class Channel(Generic[T]):
 
     @property
     def consumed(self) -> bool:
-        """Whether there is a consumer."""
         return bool(self._consumers)
 
     @property
@@ -123,23 +122,20 @@ class FollowingChannel(Channel[T], Generic[T, C]):
         self.current = find()
         self._find = find
         self._changes = changes
-        self._looks = self._find_again
 
     def add(self, consumer: Callable[[T], None], dropped: Callable[[], int]) -> None:
-        """Add a consumer; see :meth:`Channel.add`."""
         with self._lock:
             if not self._drops:
-                self._changes.add(self._looks, lambda: 0)
+                self._changes.add(self._find_again, lambda: 0)
             self._drops[consumer] = dropped
             self.current.add(consumer, dropped)
 
     def remove(self, consumer: Callable[[T], None]) -> None:
-        """Remove a consumer. Does nothing if it is unknown."""
         with self._lock:
             if self._drops.pop(consumer, None) is not None:
                 self.current.remove(consumer)
                 if not self._drops:
-                    self._changes.remove(self._looks)
+                    self._changes.remove(self._find_again)
 
     def _find_again(self, _: object) -> None:
         with self._lock, suppress(SkyloopError):  # the vehicle has no camera, or the drone was closed
@@ -240,7 +236,7 @@ class Listener(Generic[T]):
         self._calls += 1
         try:
             self._function(sample)
-        except ClosedError:  # the drone was closed or its flight ended; this is not an error of the function
+        except ClosedError:  # the drone was closed or its flight ended: count the error, but don't report it
             self.errors += 1
         except SystemExit as error:  # without this, it would only end this thread, and nobody would notice
             self._report(self.name, error)

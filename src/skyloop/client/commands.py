@@ -50,7 +50,7 @@ from skyloop.messages.config import MAX_REASON
 ANSWER_S: Final = 2.0  #: time limit for the proxy's reply to an authority request
 #: Time for the proxy to notice the end of an earlier session of this process; exceeds the time-out of its lease.
 OWN_S: Final = 5.0
-_LATER_NS: Final = 1_000_000_000
+_LATER_NS: Final = 1_000_000_000  #: maximum time until the next tick
 #: Requests by an application that the library's automatic hover must not end.
 LANDING: Final = (Land, EmergencyStop)
 _LATER_ACTIONS: Final = (Position, ReturnToStart)  #: older proxies don't know these actions
@@ -88,7 +88,7 @@ class CommandSender:
         """Prepare for sending; nothing is sent before :meth:`connected` is called.
 
         ``emit`` receives the events created here. ``changed`` is called when the status of the authority has changed,
-        and ``granted`` is called with the number of each new lease. Both run on the thread that noticed.
+        and ``granted`` is called with the number of each new lease. Both run on the thread that noticed the change.
         """
         self.role = role
         self._authority = authority
@@ -123,7 +123,6 @@ class CommandSender:
 
     @property
     def intent(self) -> int:
-        """Number of the newest intent."""
         return self.schedule.intent
 
     def latest(self, *kinds: type[AnyAction]) -> int:
@@ -201,9 +200,9 @@ class CommandSender:
             # After any other command, a new series of set-points begins, and an earlier refusal no longer applies.
             self._first_set_point = 0
             return sent
-        told = self.newest_outcome
+        newest = self.newest_outcome
         self._first_set_point = self._first_set_point or intent
-        return sent and not (told is not None and told.fate in _REFUSING and told.intent >= self._first_set_point)
+        return sent and not (newest is not None and newest.fate in _REFUSING and newest.intent >= self._first_set_point)
 
     def ask(self, action: AnyAction, *, automatic: bool = False, again: int | None = None) -> int:
         """Make ``action`` the newest set-point like :meth:`command`, and return the number of the intent.
@@ -218,8 +217,9 @@ class CommandSender:
     ) -> tuple[int, bool]:
         """Make ``action`` the newest set-point and send it if possible; return its intent and whether it was sent.
 
-        Nothing can be sent while the link is down, the person flying is absent, or the authority or the effect of an
-        emergency stop is awaited. Raises :class:`GivenUpError` if the caller has stopped waiting (:data:`cancelled`).
+        Nothing can be sent while the link is down or the person flying is absent, nor before the authority is granted
+        or an emergency stop confirmed. Raises :class:`GivenUpError` if the caller has stopped waiting
+        (:data:`cancelled`).
         """
         connection, schedule, authority = self._connection, self.schedule, self._authority
         if connection.why_closed:
@@ -247,7 +247,7 @@ class CommandSender:
                 raise self._not_ours(action)
             if not schedule.may_ask(action):
                 if now or not isinstance(action, _STREAMED):
-                    text = f"{action.name} was not sent: the emergency stop of this application has not shown yet"
+                    text = f"{action.name} was not sent: this application's emergency stop is not confirmed yet"
                     raise RefusedError(text, code=Refusal.WRONG_STATE)
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
@@ -273,7 +273,7 @@ class CommandSender:
 
     @property
     def may_ask(self) -> bool:
-        """Whether commands can be sent now: a connection exists, and this application holds the authority on it."""
+        """Whether commands can be sent now: a proxy is connected, and this application holds the authority."""
         return self._authority.held and self._connection.connected
 
     def drop(self) -> None:
@@ -332,7 +332,7 @@ class CommandSender:
             raise RefusedError(reply.message, code=reply.code.value)
 
     def release(self, *, wait: bool = True) -> None:
-        """Release the authority, or leave the queue. Does nothing if the authority is neither held nor requested.
+        """Clear the set-point, and release the authority or leave the queue if necessary.
 
         With ``wait``, raises :class:`NoAnswerError` if the proxy does not answer.
         """
@@ -378,7 +378,6 @@ class CommandSender:
             self._moved(before, now_ns)
 
     def event(self, event: Event, now_ns: int) -> None:
-        """Update the authority from an event."""
         with self._lock:
             before = self.status
             changed = self._authority.event(event, now_ns)
@@ -409,7 +408,7 @@ class CommandSender:
             text = "the application made no call for too long, so its set-point decayed to hover"
             self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
         if unshown:
-            text = "the emergency stop is no longer sent: the vehicle has not shown it, and may fly"
+            text = "the emergency stop is no longer sent: the vehicle has not confirmed it, and may still be flying"
             self._emit(EventKind.VEHICLE_MESSAGE, text, reason="stop_given_up")
         return due_ns
 
@@ -451,7 +450,7 @@ class CommandSender:
             elif isinstance(answer, Refused):
                 self._refusal = answer
                 changed = self._authority.given_back()
-            else:  # no answer arrived, so the next tick sends the request again
+            else:  # no answer arrived: the next tick repeats the request
                 self._authority.pending = False
                 changed = False
         if changed:
@@ -491,7 +490,7 @@ class CommandSender:
         later = "; it is sent if that changes within half a second" if type(action) is Land else ""
         not_sent = f"{action.name} was not sent"
         if self._authority.held and self._connection.connected:
-            return AuthorityError(f"{not_sent}: the person who flies is not known to be present", code="no_authority")
+            return AuthorityError(f"{not_sent}: the person flying is not known to be present", code="no_authority")
         if self._connection.connected:
             text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
             return AuthorityError(text, code="no_authority")

@@ -25,7 +25,7 @@ from skyloop.errors import Hint, LinkError, MissingExtraError, NoAnswerError, Un
 from skyloop.platform import read_within
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
-NAME_TIMEOUT_S: Final = 5.0
+NAME_TIMEOUT_S: Final = 5.0  #: time limit for a running proxy to answer
 START_TIMEOUT_S: Final = 20.0  #: time limit for a private proxy and its vehicle to start
 WAKE_S: Final = 60.0  #: time limit for a vehicle to start up; no driver needs longer
 #: Entry-point group of connectors, named after address schemes; each returns a :class:`Connector` or None.
@@ -52,8 +52,8 @@ class Network:
 
     Attributes:
         address: An address such as ``"10.0.0.5:7447"``, or several separated by commas (include ``multicast`` to search
-            as well). True searches by multicast, and False stays on this host. None: uses the variable
-            ``SKYLOOP_NETWORK`` or, if the variable is not set, searches by multicast.
+            as well). True searches by multicast, and False stays on this host. None uses the variable
+            ``SKYLOOP_NETWORK`` or, if it is not set, searches by multicast.
         keys: Folder that contains an identity; None: the folder given by the variable ``SKYLOOP_KEYS``.
     """
 
@@ -206,7 +206,6 @@ def _connector(uri: str) -> Connector:
 
 
 def _script_name() -> str:
-    """Return the name of the running script for display."""
     script = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python")
     stem = script.parent.name if script.stem == "__main__" else script.stem
     return (stem.strip("-") or "python")[:64]
@@ -274,7 +273,7 @@ class PrivateProxy:
         return dial
 
     def close(self) -> None:
-        """End the child; if it is landing a flying vehicle, wait for it for at most 4 s. Idempotent.
+        """End the child; if it is still landing its vehicle after 4 s, return and let it finish. Idempotent.
 
         A child that never served a client is terminated after 4 s and killed after another 4 s.
         """

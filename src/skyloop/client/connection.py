@@ -20,7 +20,7 @@ from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, 
 from skyloop.messages import AnyReply, AnyRequest, Hello, LinkState, Refused, Welcome
 from skyloop.transport.base import Dialer
 
-_LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
+_CHECK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
 _AGAIN_S: Final = 1.0  #: how often a thread that waits for samples retries receiving them itself
 _log = logging.getLogger("skyloop")
 
@@ -90,10 +90,10 @@ class ProxyConnection:
         return session is not None and session.receiving
 
     @property
-    def variants(self) -> bool:
+    def adapts_frames(self) -> bool:
         """Whether the proxy adapts frames as requested; within one host, frames arrive unchanged."""
         session = self.session
-        return session is not None and session.variants
+        return session is not None and session.adapts_frames
 
     @property
     def offset_ns(self) -> int:
@@ -123,7 +123,7 @@ class ProxyConnection:
             raise UsageError("an inline callback can't wait for packets that it would itself have to receive")
 
     def poke(self) -> None:
-        """Wake the supervisor to make it attend to the connection now."""
+        """Make the supervisor attend to the connection now."""
         self.poked = True
         self.woken.notify()
 
@@ -188,7 +188,7 @@ class ProxyConnection:
         while not self.closing:
             left_s, sent = deadline - time.monotonic(), self.session is not None
             self.ask(body(), done, max(left_s, 0.001))
-            notifier.wait_for(lambda: bool(answers), left_s + 1.0)
+            notifier.wait_for(lambda: bool(answers), left_s + 1.0)  # the supervisor reports the time-out, maybe late
             answer = answers.pop() if answers else NoAnswerError("the link's thread has ended")
             if not isinstance(answer, LinkError):
                 return answer
@@ -196,7 +196,7 @@ class ProxyConnection:
                 raise NoAnswerError(f"{answer} (time-out {timeout_s:g} s)") from answer
             if sent and not may_repeat():
                 raise LinkError(f"{answer}, after the request was sent: it may have been carried out") from answer
-            notifier.wait_for(lambda: self.closing, 0.02)
+            notifier.wait_for(lambda: self.closing, 0.02)  # the link is down: try again soon
         raise ClosedError("this drone was closed")
 
     def forked(self) -> None:
@@ -311,16 +311,15 @@ class ConnectionSupervisor:
             self.connection.woken.wait_for(lambda: self.connection.poked, pause_s)
 
     def _step(self) -> float:
-        """Do all due work; return the time until the next work [s]."""
         session = self.connection.session
         if session is None:
             return self._redial()
         now_ns = self._clock()
-        if now_ns >= session.look_ns or session.closed_reason is not None or self.connection.state is not LinkState.UP:
-            session.look_ns = now_ns + _LOOK_NS
+        if now_ns >= session.check_ns or session.closed_reason is not None or self.connection.state is not LinkState.UP:
+            session.check_ns = now_ns + _CHECK_NS
             if not self._judge(session, now_ns):
                 return self._policy.pause_s(self._failures)
-        due_ns = min(session.look_ns, self._handler.tick(now_ns))
+        due_ns = min(session.check_ns, self._handler.tick(now_ns))
         return max(0.0, (due_ns - self._clock()) / 1e9)
 
     def _judge(self, session: ProxySession, now_ns: int) -> bool:

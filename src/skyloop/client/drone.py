@@ -83,7 +83,7 @@ from skyloop.messages import (
 from skyloop.messages.command import check_pose
 from skyloop.messages.frame import Chain
 from skyloop.messages.relayed import Shape
-from skyloop.messages.subscription import PLAIN
+from skyloop.messages.subscription import EVERY_SAMPLE
 from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
@@ -114,7 +114,7 @@ class DroneOptions(TypedDict, total=False):
 
 
 def by_name(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function of keyword-only numbers so that a wrong call raises an error with the correct one."""
+    """Decorate a function of keyword-only arguments so that a wrong call raises an error that shows a correct one."""
     known = list(function.__kwdefaults__ or {})
 
     @wraps(function)
@@ -153,12 +153,11 @@ class Drone:
     connection to the proxy is re-established, however long that takes. Then everything but old set-points is restored.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command describes the full desired
-    state. It is sent immediately and then repeated at ``rate_hz`` until the next command. All commands except
-    :meth:`takeoff` and :meth:`land` return True if the command was handed to the transport. They return False while the
-    link is down or the authority has not been granted yet. The command is then sent once both are available, unless it
-    is more than 0.5 s old by that time. Set-points (velocity, attitude, position) also return False while the proxy is
-    known to refuse them, for example on the ground or while someone else flies the vehicle. Events give the
-    reason. Every command raises:
+    state. It is sent immediately and then repeated at ``rate_hz`` until the next command. Commands that return a bool
+    return True if the command was handed to the transport, and False while the link is down or the authority has not
+    been granted yet. The command is then sent once both are available, unless it is more than 0.5 s old by that time.
+    Set-points also return False while the proxy is known to refuse them, for example on the ground or while someone
+    else flies the vehicle. Events give the reason. Every command raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
@@ -209,7 +208,7 @@ class Drone:
         schedule = CommandSchedule(rate_hz=rate_hz, stall_s=stall_s)
         changed = state.notifier.notify
         self._commands = CommandSender(
-            role, authority, schedule, connection, scheduler, emit=state.emit, changed=changed, granted=restorer.granted
+            role, authority, schedule, connection, scheduler, emit=state.emit, changed=changed, granted=restorer.restore
         )
         self._piloting = Piloting(connection, state, self._commands, on_exit, self.close)
         receiver = SessionSamples(state, connection, self._commands, restorer)
@@ -230,8 +229,8 @@ class Drone:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone on failure.
 
         ``timeout_s`` limits the wait for the proxy's answer, for the first feedback and, as a pilot, for the vehicle to
-        start up. If ``wake_s`` is longer, it limits starting up once the vehicle accepts commands. With
-        ``acquire=False``, a pilot requests no authority yet. Raises the errors of :func:`skyloop.connect`.
+        start up, which gets at least ``wake_s`` once the authority is granted. With ``acquire=False``, a pilot does not
+        request the authority yet. Raises the errors of :func:`skyloop.connect`.
         """
         state = self._state
 
@@ -416,11 +415,7 @@ class Drone:
         self._commands.release()
 
     def command(self, action: AnyAction) -> bool:
-        """Make ``action`` the newest set-point.
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
-        """
+        """Make ``action`` the newest set-point. See :class:`Drone` for return values and exceptions."""
         return self._commands.command(checked(action))
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
@@ -480,14 +475,13 @@ class Drone:
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly at a velocity given in the levelled body axes, which turn with the yaw but not with roll and pitch.
 
+        See :class:`Drone` for return values and exceptions.
+
         Args:
             forward: Velocity along x, forward [m/s].
             left: Velocity along y, to the left [m/s].
             up: Velocity along z, up [m/s].
             yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
         """
         if not _all_finite(forward, left, up, yaw_rate):
             forward, left = number("forward", forward), number("left", left)
@@ -496,16 +490,13 @@ class Drone:
 
     @by_name
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Hold an attitude while climbing or descending at a given rate.
+        """Hold an attitude while climbing or descending. See :class:`Drone` for return values and exceptions.
 
         Args:
             roll: Roll [rad]; right side down is positive and accelerates the vehicle to the right.
             pitch: Pitch [rad]; nose down is positive and accelerates the vehicle forward.
             climb: Vertical velocity, up positive [m/s].
-            yaw_rate: Counter-clockwise seen from above [rad/s].
-
-        Returns:
-            True if the command was handed to the transport; :class:`Drone` explains this and lists the exceptions.
+            yaw_rate: Yaw rate, counter-clockwise seen from above [rad/s].
         """
         if not _all_finite(roll, pitch, climb, yaw_rate):
             roll, pitch = number("roll", roll), number("pitch", pitch)
@@ -540,7 +531,7 @@ class Drone:
         Args:
             x: Distance east of the origin [m].
             y: Distance north of the origin [m].
-            z: Up [m].
+            z: Height above the origin [m].
             latitude_deg: Latitude [°], north positive; used instead of x, y and z.
             longitude_deg: Longitude [°], east positive.
             altitude_m: Altitude above mean sea level [m]; None: the current height.
@@ -576,8 +567,8 @@ class Drone:
 
         If the vehicle is below a safe height, it first climbs straight up, within ``limits.altitude``, the ceiling of
         the room and the top of the safety box. It then flies straight to a point above its start
-        (:attr:`start_position`), as :meth:`go_to` does, and lands. Any other command, another pilot or a failsafe ends
-        the flight. The vehicle does not avoid obstacles.
+        (:attr:`start_position`), as :meth:`go_to` does, and lands or hovers there. Any other command, another pilot or
+        a failsafe ends the flight. The vehicle does not avoid obstacles.
 
         Args:
             height_m: Minimum height above the start during the flight [m]; None: the parameter ``return.height``.
@@ -740,13 +731,11 @@ class Drone:
         return self.feedback(max_hz=max_hz)
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
-        """Return the newest frame without waiting.
-
-        The first call subscribes to the camera permanently.
+        """Return the newest frame without waiting. The first call subscribes to the camera permanently.
 
         Args:
             camera: Name of the camera; None: the vehicle's first camera.
-            max_age_s: Maximum age since capture [s]; None: any.
+            max_age_s: Maximum age since capture [s]; None: no limit.
 
         Returns:
             The frame; None if no frame has arrived yet, or if it is too old or can't be decoded.
@@ -773,7 +762,7 @@ class Drone:
             timeout_s: How long to wait [s].
 
         Raises:
-            NoAnswerError: If none arrives in time.
+            NoAnswerError: If no frame arrives in time.
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone is closed.
@@ -856,14 +845,14 @@ class Drone:
         wanted, what = as_predicate(state)
         met: list[Feedback] = []
 
-        def look() -> bool:
+        def is_met() -> bool:
             newest = self._state.newest
             if newest is not None and wanted(newest):
                 met.append(newest)
             return bool(met) or self.closed
 
-        with self._state.demand.wanted(PLAIN):
-            in_time = self._state.notifier.wait_for(look, timeout_s)
+        with self._state.demand.wanted(EVERY_SAMPLE):
+            in_time = self._state.notifier.wait_for(is_met, timeout_s)
         if not in_time:
             newest = self._state.newest
             now = "its state is unknown" if newest is None else f"it is {newest.state.value}"
@@ -894,7 +883,7 @@ class Drone:
     def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
         """Call ``function`` once a second with an overview of all vehicles in the proxy's process (:meth:`overview`).
 
-        It is called in its own thread or, with ``inline``, on the receiving thread.
+        It runs in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
@@ -915,21 +904,21 @@ class Drone:
     def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
         """Call ``function`` with the proxy's echo of every command from any application; up to 256 echoes may wait.
 
-        It is called in its own thread or, with ``inline``, on the receiving thread.
+        It runs in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
     def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
         """Call ``function`` with the annotations that applications draw on frames; up to 256 annotations may wait.
 
-        It is called in its own thread or, with ``inline``, on the receiving one.
+        It runs in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
 
     def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
         """Call ``function`` with all applications' log entries (``drone.log``), including our own; up to 256 wait.
 
-        It is called in its own thread or, with ``inline``, on the receiving one.
+        It runs in its own thread or, with ``inline``, on the receiving thread.
         """
         return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
 
@@ -945,7 +934,7 @@ class Drone:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
-            function: Called in its own thread with the newest frames it has not seen; up to ``depth`` frames wait.
+            function: Called in its own thread with frames that it has not seen yet.
             camera: Name of the camera; None: the vehicle's first camera, whichever it is after a restart.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Whether to call it on the receiving thread instead, with every frame. It must be quick and not wait.
@@ -957,8 +946,6 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        if depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
         max_age_s = how.get("max_age_s")
@@ -1003,8 +990,6 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        if depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 picture")
         self._check_listener(function)
 
         def find() -> StreamChannel:
@@ -1022,7 +1007,7 @@ class Drone:
             if follows:
                 function(picture)
 
-        return self._listen(stream, call, f"pictures of {camera or 'the camera'}", depth=depth, inline=inline)
+        return self._listen(stream, call, f"encoded frames of {camera or 'the camera'}", depth=depth, inline=inline)
 
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.
@@ -1063,9 +1048,7 @@ class Drone:
     # Results of processors ---------------------------------------------------------------------------------------
 
     def result(self, processor: str, *, max_age_s: float | None = None) -> Result | None:
-        """Return a processor's newest result without waiting.
-
-        The first call subscribes to the processor permanently.
+        """Return a processor's newest result without waiting. The first call subscribes to the processor permanently.
 
         Args:
             processor: Name of the processor.
@@ -1134,14 +1117,13 @@ class Drone:
             UsageError: If ``function`` is not callable or another argument is out of range.
             ClosedError: If the drone was closed.
         """
-        if depth is not None and depth < 1:
-            raise UsageError(f"depth is {depth!r} and must be at least 1 result")
         known, make = self._state.results, partial(ResultListener, max_age_s=checked_age(max_age_s))
         if processor is None:
             channel, name, usual = known.everything, "results", EVENT_DEPTH
         else:
             channel, name, usual = known.channel(processor), f"results of {processor}", 1
-        listener = self._listen(channel, function, name, depth=depth or usual, inline=inline, make=make)
+        depth = usual if depth is None else depth
+        listener = self._listen(channel, function, name, depth=depth, inline=inline, make=make)
         assert isinstance(listener, ResultListener)
         return listener
 
@@ -1164,7 +1146,7 @@ class Drone:
         self._connection.check_may_wait()
         state = self._state
         before = None if state.demand.request.is_plain else state.newest
-        with state.demand.wanted(PLAIN):
+        with state.demand.wanted(EVERY_SAMPLE):
             if before is not None:  # if a reduced rate was requested, wait for a complete sample
                 state.notifier.wait_for(lambda: state.newest is not before, WHOLE_S)
             return inspect(self, state.newest, video_s, folder)
@@ -1231,6 +1213,8 @@ class Drone:
         make: Callable[..., Listener[T]] = Listener,
     ) -> Listener[T]:
         self._check_listener(function)
+        if depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be at least 1")
         state, report = self._state, self._piloting.report
         inline = inline or state.scheduler.in_step
         listener = make(function, channel, report, name=name, depth=depth, inline=inline, on_cancel=state.forget)
@@ -1261,7 +1245,7 @@ def open_drone(
 
 
 def _feedback_request(max_hz: float | None) -> FeedbackRequest:
-    return PLAIN if max_hz is None else FeedbackRequest(max_hz)
+    return EVERY_SAMPLE if max_hz is None else FeedbackRequest(max_hz)
 
 
 def _from_numpy(value: Any) -> Any:

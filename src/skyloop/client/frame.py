@@ -247,8 +247,8 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
     """Convert a frame's bytes to BGR, shape (height, width, 3), uint8; bytes that are already BGR are not copied.
 
-    Raises :class:`DecodeError` if the bytes are not a JPEG of the size in the header, and :class:`MissingExtraError` if
-    they are a JPEG and OpenCV is not installed.
+    For a JPEG, raises :class:`DecodeError` if it is damaged or does not have the size in the header, and
+    :class:`MissingExtraError` if OpenCV is not installed.
     """
     height, width = header.height, header.width
     encoding = header.encoding

@@ -27,7 +27,7 @@ class Thresholds:
     silent_s: float = 1.0  #: time without any packet after which the link is reconnected
     missing_share: float = 0.1  #: fraction of missing or malformed samples in a window that degrades the link
     window_s: float = 1.0
-    malformed: int = 5  #: number of malformed packets in a window at which the link is reconnected
+    malformed: int = 5  #: number of malformed packets in a window after which the link is reconnected
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ _Counts = tuple[int, int, int]  #: at_ns, received, missing: a time, and the tot
 
 #: Maximum gap tolerated because of a low feedback rate [s]; at lower rates, pings check the link.
 MAX_PATIENCE_S: Final = 2.0
-WINDOW_PERIODS: Final = 10.0  #: minimum number of samples for computing the missing fraction
+WINDOW_PERIODS: Final = 10.0  #: minimum window for the missing fraction [feedback periods]
 
 
 class LinkMonitor:
@@ -192,6 +192,7 @@ class OffsetEstimator:
     def add(self, sent_ns: int, theirs_ns: int, received_ns: int) -> Offset:
         """Add a round trip that was answered at ``theirs_ns`` on the proxy's clock; return the estimate at its end."""
         received_ns = max(sent_ns, received_ns)
+        # Both clocks are read in whole nanoseconds, so each bound may be off by 1.
         self._trips.append((sent_ns, theirs_ns - received_ns - 1, theirs_ns - sent_ns + 1))
         return self.at(received_ns)
 
@@ -271,7 +272,7 @@ class ChannelCounter:
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """Count a sample that was captured and received at these times on this process's clock."""
+        """Count a sample, its delay, and its times of capture and reception on this process's clock."""
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -307,7 +308,7 @@ class ChannelCounter:
 
 
 def _rate(arrivals_ns: NDArray[np.int64], now_ns: int) -> float:
-    """Return samples per second over the last two seconds, or since the first sample if that is shorter."""
+    """Return the samples per second between the first and the last sample of the last two seconds."""
     recent = arrivals_ns[arrivals_ns > now_ns - 2_000_000_000]
     if recent.size < 2:
         return 0.0

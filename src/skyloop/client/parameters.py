@@ -29,9 +29,9 @@ from skyloop.messages import (
     Value,
 )
 
-ANSWER_S = 2.0
+ANSWER_S = 2.0  #: time limit for the proxy's answer
 MAX_TEXT = 4096  #: maximum number of characters in a string value
-MAX_NUMBERS = 256
+MAX_NUMBERS = 256  #: maximum number of elements in a list
 _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusal.OBSERVER})
 
 
@@ -52,7 +52,7 @@ class Restorer:
         self._run_id = 0
         self._lease = 0  # this application's last lease in this run of the proxy
         self._missed = False  # whether the connection was lost after that lease; events may be missing
-        self._restore = False  # whether the proxy has restarted since the values were written
+        self._lost = False  # whether the proxy has restarted, and lost the values, since they were written
 
     def written(self, parameter: Parameter) -> None:
         """Record a value written by this application."""
@@ -70,22 +70,22 @@ class Restorer:
         with self._lock:
             self._missed = True
             if run_id != self._run_id:
-                self._restore = self._run_id != 0
+                self._lost = self._run_id != 0
                 self._run_id, self._lease = run_id, 0
 
-    def granted(self, lease: int) -> None:
-        """After the authority is granted, rewrite the values that a restarted proxy has lost. Does not wait."""
+    def restore(self, lease: int) -> None:
+        """Under a newly granted lease, rewrite the values that a restarted proxy has lost. Does not wait."""
         with self._lock:
             others, self._lease = self._missed and lease != self._lease + 1, lease
-            restore, written = self._restore, dict(self._written)
-            self._missed = self._restore = False
+            lost, written = self._lost, dict(self._written)
+            self._missed = self._lost = False
             if others:
                 self._written.clear()
-        if restore and others and written:
+        if lost and others and written:
             names = ", ".join(sorted(written))
             text = f"the proxy restarted and others have flown since: {names} were not restored, set them if needed"
             self._emit(EventKind.PARAMETER_CHANGED, text, Severity.WARNING, reason="others")
-        elif restore:
+        elif lost:
             for name, value in written.items():
                 self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
 
@@ -93,7 +93,7 @@ class Restorer:
         def done(answer: AnyReply | LinkError) -> None:
             if isinstance(answer, LinkError):
                 with self._lock:
-                    self._restore = True  # the link was lost again: retry after the next grant
+                    self._lost = True  # the link was lost again: retry after the next grant
             elif isinstance(answer, Refused):
                 text = f"{name} could not be restored to {value!r}: {answer.message}"
                 self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
@@ -195,7 +195,7 @@ class Config(Mapping[str, Value]):
 
 def _name(name: object) -> str:
     if not isinstance(name, str) or not 1 <= len(name) <= 128:
-        raise UsageError(f"a parameter's name must be a text of 1 to 128 characters, got {name!r}")
+        raise UsageError(f"a parameter's name must be a string of 1 to 128 characters, got {name!r}")
     return name
 
 
@@ -219,6 +219,6 @@ def plain_value(name: str, value: object) -> Value:
         if all(isinstance(one, numbers.Real) for one in many):
             return tuple(float(one) for one in many)
     raise UsageError(
-        f"{name} can't be {value!r:.80}: use a bool, a number, a text (up to {MAX_TEXT} characters) or a list of up to "
-        f"{MAX_NUMBERS} numbers"
+        f"{name} can't be {value!r:.80}: use a bool, a number, a string of up to {MAX_TEXT} characters or a list of "
+        f"up to {MAX_NUMBERS} numbers"
     )

@@ -43,7 +43,7 @@ RETURN_S: Final = 180.0  #: how long to wait for a return flight that the proxy 
 AGAIN_NS: Final = 500_000_000  #: interval between attempts at a take-off that is not possible yet [ns]
 #: If the proxy reports no outcome, feedback that arrives sooner than this after a command may predate the command [ns].
 _STALE_NS: Final = 100_000_000
-_NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)
+_NOT_YET: Final = (Refusal.DRIVER_FAILED, Refusal.VEHICLE_LINK_LOST)  #: reasons after which a take-off is retried
 _ENDED_IN: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 _SINKING: Final = (*_ENDED_IN, FlightState.LANDING)
 _log = logging.getLogger("skyloop")
@@ -95,8 +95,8 @@ class Piloting:
     ) -> None:
         """Send the command and, with ``wait``, wait until feedback confirms its completion; see :meth:`Drone.land`.
 
-        If a take-off does not complete in time, give up control of the vehicle. Also give up control if the caller
-        stops waiting, for example after Ctrl-C, unless it was waiting for a landing.
+        Call :meth:`let_go` if a take-off does not complete in time, and if the caller stops waiting for anything but a
+        landing, for example after Ctrl-C.
         """
         if not wait:
             self.commands.command(action, now=True)
@@ -135,8 +135,8 @@ class Piloting:
 
         Because the library decides this, not a person, the vehicle is left alone if others are flying it, if it is
         landing or returning, or if this application has landed or stopped it. The proxy applies the same rule. A
-        take-off without visible effect is cancelled. With ``land``, it lands instead of hovering. Returns whether
-        anything was sent.
+        take-off without visible effect is cancelled. With ``land``, the vehicle lands instead of hovering. Returns
+        whether anything was sent.
         """
         commands, feedback, kind = self.commands, self._state.newest, type(self.commands.newest)
         if self.closed or kind in LANDING or (kind is Hover and not land):
@@ -177,13 +177,16 @@ class Piloting:
     def bring_down(
         self, reason: str, report: Callable[[str], object] = lambda _: None, *, land: bool = True
     ) -> SkyloopError | None:
-        """If this application flies the vehicle, land and wait; otherwise give up control. See :meth:`end_flight`."""
+        """If this application flies the vehicle, land it and wait, or let go of it if ``land`` is False.
+
+        ``report`` and the result are those of :meth:`end_flight`; ``reason`` is for the log.
+        """
         self.finish_stop()
         feedback = self._state.newest
         if not self._flies():
             if feedback is not None and feedback.state.airborne and (whose := self._others_hands()):
-                if land and feedback.others and feedback.state not in _SINKING:  # we may just have flown it
-                    _log.warning("%s: %s: it stays in the air, not landed from here", self._state.name, whose)
+                if land and feedback.others and feedback.state not in _SINKING:  # it may have been ours until just now
+                    _log.warning("%s: %s: leaving it in the air, not landing it", self._state.name, whose)
                 report(f"{whose}: leaving the drone to it")
             return None
         try:
@@ -200,7 +203,7 @@ class Piloting:
         except RefusedError as error:
             if not self._state.notifier.wait_for(lambda: self._others_hands() != "", OTHERS_S):
                 return error
-            report(f"{self._others_hands()}: leaving the drone to it")  # or to a controller that just took over
+            report(f"{self._others_hands()}: leaving the drone to it")
         except SkyloopError as error:
             return error
         return None
@@ -258,8 +261,7 @@ class ActionWait:
         self._flew = False  # whether the vehicle has been in the air since
         self._refused, self._refused_ns = 0, 0  # newest intent not possible yet, and when it was first refused
         self._asked_ns = state.scheduler.clock()
-        # The call may take the vehicle only from the pilot of this moment, or of the moment at which the action can
-        # first be sent.
+        # The call may take the vehicle only from whoever flies it now, or when the action can first be sent.
         self._others, self._may_be_sent = self._others_now, commands.may_ask
         self._intent = commands.ask(action, automatic=automatic)
 
@@ -273,12 +275,7 @@ class ActionWait:
     def wait(self, timeout_s: float, deadline_s: float) -> None:
         """Wait for the action until ``deadline_s`` on ``time.monotonic``; error messages mention ``timeout_s``.
 
-        Raises:
-            NoAnswerError: If the action is not complete in time.
-            ClosedError: If the drone is closed.
-            AuthorityError: If another application takes over.
-            UnsupportedError: If the vehicle does not support the action.
-            RefusedError: If the proxy refuses the action in the current state, or something else ends it.
+        Raises :class:`NoAnswerError` if it is not complete in time, or the error that explains why it can't complete.
         """
         if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
             raise NoAnswerError(self._not_reached(timeout_s))
@@ -319,10 +316,10 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
-        told = self._commands.newest_outcome
-        if told is not None and told.intent == self._intent and told.fate not in OUTDONE:
-            self._note(told.text)  # the text is cleared once the repeated request is executed
-            if not told.over:  # it was executed; any other holder took the vehicle afterwards
+        newest = self._commands.newest_outcome
+        if newest is not None and newest.intent == self._intent and newest.fate not in OUTDONE:
+            self._note(newest.text)  # the text is cleared once the repeated request is executed
+            if not newest.over:  # it was executed; whoever else flies the vehicle took it afterwards
                 self._others, self._may_be_sent = None, True
         outcome = self._commands.outcome(self._intent)
         if outcome is None or not outcome.failed:
@@ -376,9 +373,9 @@ class ActionWait:
             return True
         # A hover or idle command cancels a take-off without visible effect: if the vehicle is still on the ground, the
         # take-off is over.
-        stayed, told = commands.latest(Hover, Idle), commands.newest_outcome
+        stayed, outcome = commands.latest(Hover, Idle), commands.newest_outcome
         stands = newest is not None and newest.state is FlightState.LANDED
-        return stands and self._intent < stayed and told is not None and told.intent >= stayed
+        return stands and self._intent < stayed and outcome is not None and outcome.intent >= stayed
 
     def _why_no_landing(self, outcome: Outcome) -> Exception | None:
         """Return why waiting is pointless. Old commands aren't resent, but the caller still waits for this landing."""

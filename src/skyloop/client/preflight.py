@@ -22,13 +22,13 @@ from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, Link
 from skyloop.messages.parameter import CHECKUP, Diagnostic, decode_checkup
 
 STALE_S: Final = 1.0  #: maximum age for feedback to count as current [s]
-STALE_VIDEO_S: Final = 1.0
+STALE_VIDEO_S: Final = 1.0  #: maximum age for a frame to count as current [s]
 CLOCK_S: Final = 0.05  #: maximum uncertainty of the samples' ages [s]
 LEVEL_RAD: Final = 0.12  #: maximum tilt at which a vehicle counts as level [rad]
 ACTIVE: Final = "camera.active"  #: the parameter that selects the camera, for vehicles that send one camera at a time
 _COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
-FREE_BYTES: Final = 1_000_000_000  #: minimum free disk space for recordings
-FULL_BYTES: Final = 100_000_000
+FREE_BYTES: Final = 1_000_000_000  #: free disk space below which the storage check warns
+FULL_BYTES: Final = 100_000_000  #: free disk space below which the storage check fails
 FAR_M: Final = 10_000.0  #: a wall of the safety box is ignored if it is at least this far away [m]
 
 
@@ -226,7 +226,7 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
             Level.WARN,
             f"another controller has it: {feedback.others}",
             "the proxy leaves it alone until a pilot commands hover, landing or take-off",
-            "agree with the person who flies it",
+            "agree with the person flying it",
         )
     else:
         yield _ok("vehicle", str(feedback.state).replace("_", " "))
@@ -250,7 +250,7 @@ def _battery(state: PreflightState) -> Iterator[PreflightFinding]:
         why = "it would land right after take-off and accept no other command"
     elif charge < back:
         level, detail = Level.FAIL, f"{detail}, below {back:.0%} (battery.return)"
-        why = "it refuses to take off, as it would return at once"
+        why = "it refuses to take off, because it would return at once"
     elif charge < warn:
         level = Level.WARN
     yield _judged(level, "battery", detail, why, "charge or change it")

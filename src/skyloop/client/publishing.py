@@ -1,4 +1,4 @@
-"""Publish what an application produces besides commands: its log, and its results as a processor's worker."""
+"""Publish an application's log entries, and its results as a worker of a processor."""
 
 from __future__ import annotations
 
@@ -29,13 +29,12 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import LATEST_NS
-from skyloop.messages.relayed import MAX_CODE, MAX_LOG_TEXT, MAX_VALUES, pack
+from skyloop.messages.relayed import MAX_CODE, MAX_DIMENSIONS, MAX_LOG_TEXT, MAX_VALUES, pack
 
 if TYPE_CHECKING:
     from skyloop.client.telemetry import ClientState
 
 RENEW_S: Final = 0.25  #: how often the membership is renewed [s]; without renewal, a worker counts as silent after 1 s
-MAX_DIMENSIONS: Final = 8  #: maximum number of dimensions of an array in the log
 
 
 class Logbook:
@@ -60,7 +59,7 @@ class Logbook:
         if name != "":
             _named(name)
         if not isinstance(text, str) or len(text) > MAX_LOG_TEXT:
-            raise UsageError(f"only texts of at most {MAX_LOG_TEXT} characters can be logged, got {text!r:.80}")
+            raise UsageError(f"only strings of at most {MAX_LOG_TEXT} characters can be logged, got {text!r:.80}")
         try:
             known = Severity(severity)
         except ValueError:
@@ -144,7 +143,7 @@ class Membership:
         """Prepare to join; :meth:`start` joins. ``find`` returns the camera's name, even after the proxy restarts."""
         connection.check_may_wait()
         if not isinstance(code, str) or len(code) > MAX_CODE:
-            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
+            raise UsageError(f"code is {code!r:.80} and must be a string of at most {MAX_CODE} characters")
         self.processor = checked_name(processor)
         self.camera = find()
         self._find = find
@@ -161,7 +160,6 @@ class Membership:
         self._state = state
         self._wake = threading.Event()
         self._ended = False
-        self._take_share, self._take_welcome = self._shared_out, self._welcomed
         self._thread = threading.Thread(target=self._run, name=f"skyloop-{processor}", daemon=True)
 
     def start(self, timeout_s: float) -> None:
@@ -170,8 +168,8 @@ class Membership:
         Raises :class:`NameTakenError` if another application runs other code under this name, :class:`RefusedError` if
         the proxy refuses for another reason, and :class:`LinkError` if it doesn't answer or the drone is closed.
         """
-        self._state.on_share.add(self._take_share, lambda: 0)
-        self._state.on_welcome.add(self._take_welcome, lambda: 0)
+        self._state.on_share.add(self._shared_out, lambda: 0)
+        self._state.on_welcome.add(self._welcomed, lambda: 0)
         try:
             answer = self._connection.call(self._asked, timeout_s)
             if isinstance(answer, Refused):
@@ -216,8 +214,8 @@ class Membership:
             self._thread.join()
 
     def _leave(self) -> None:
-        self._state.on_share.remove(self._take_share)
-        self._state.on_welcome.remove(self._take_welcome)
+        self._state.on_share.remove(self._shared_out)
+        self._state.on_welcome.remove(self._welcomed)
         self.share = None
 
     def _asked(self) -> JoinProcessor:

@@ -98,7 +98,7 @@ class Result:
     def to(self, kind: type[T]) -> T:
         """Convert the value to a dataclass, ``msgspec.Struct`` or other type; raise :class:`DecodeError` on failure."""
         try:
-            return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
+            return msgspec.convert(self.value, kind, dec_hook=lambda _kind, value: value)  # arrays stay as they are
         except (msgspec.ValidationError, TypeError) as error:
             raise DecodeError(f"a result of {self.processor} is not a {kind.__name__}: {error}") from None
 
@@ -110,10 +110,6 @@ class Result:
     def __repr__(self) -> str:
         header = self.header
         return f"<Result of {header.processor} for {header.camera} {header.seq}, {self.age_s * 1e3:.0f} ms old>"
-
-
-def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (signature of msgspec's hook)
-    return value
 
 
 class ResultMailbox:
@@ -189,7 +185,7 @@ class ResultListener(Listener[Result]):
     """A listener that skips results that are too old when delivered, and counts them in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
-        """Start calling the function; ``max_age_s`` [s], None: no limit; other arguments as for :class:`Listener`."""
+        """Start calling the function, but skip results older than ``max_age_s``; for the rest see :class:`Listener`."""
         self.expired = 0  #: number of results too old when they would have been delivered
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
@@ -207,7 +203,7 @@ class ResultListener(Listener[Result]):
 
 
 class ResultChannel(Channel[Result]):
-    """Results of one processor, without those for frames older than the frame of an earlier result."""
+    """Results of one processor; a result that arrives after one for a later frame of its camera is skipped."""
 
     def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
         self.name = results(processor)  #: name of the topic
@@ -229,7 +225,7 @@ class ResultChannel(Channel[Result]):
         return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
 
     def receive(self, result: Result) -> bool:
-        """Publish a result unless a newer one was; return False if it has already arrived on the other topic."""
+        """Publish a result unless one for a later frame was; return False if it already came on the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -279,11 +275,10 @@ class ResultChannels:
             return found
 
     def all(self) -> list[ResultChannel]:
-        """Return all channels."""
         return list(self._channels.values())
 
     def next_number(self, processor: str) -> int:
-        """Return the number of this application's next result. Each processor may have only one worker at a time."""
+        """Return the number of the next result; this application may run only one worker per processor."""
         self._sent[processor] += 1
         return self._sent[processor]
 
@@ -293,7 +288,6 @@ class ResultChannels:
             channel.restart()
 
     def receive(self, header: ProcessorResult, now_ns: int) -> None:
-        """Publish a result received at ``now_ns``."""
         offset_ns = self._connection.offset_ns
         result = Result(header, now_ns, offset_ns, self._history, self._scheduler.clock)
         channel = self._channels.get(header.processor)

@@ -28,7 +28,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.fields import CHANNELS
-from skyloop.messages.subscription import PLAIN
+from skyloop.messages.subscription import EVERY_SAMPLE
 from skyloop.transport.base import FEEDBACK, Dialer, Pixels, stream, video
 
 RETRY_S = 0.3  #: interval at which unanswered requests are repeated; all requests are idempotent
@@ -113,8 +113,8 @@ PING_S: Final = 1.0  #: time limit for a ping
 FEEDBACK_STALL_S: Final = 1.0  #: time without feedback from a responding proxy before resubscribing
 _VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often to measure the offset of a proxy's clock that differs from ours
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval after only a few round trips
-_FIRST: Final = 5
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same interval for the first few round trips
+_FIRST_TRIPS: Final = 5  #: number of round trips measured at this shorter interval
 
 
 class ConnectionHandler(Protocol):
@@ -152,15 +152,15 @@ class ProxySession:
         self._video_users: dict[str, set[str]] = {}  # by topic of the transport: the requested topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {**handler.samples, Reply: self._reply}
         self._take_feedback = handler.feedback
-        self._feedback = PLAIN  # the variant of feedback received in this session
-        self._only_plain = False  # whether the proxy offers no other variant
+        self._feedback = EVERY_SAMPLE  # the feedback requested in this session
+        self._only_plain = False  # whether only every sample may be requested, because a reduced rate brought none
         self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock minus ours
         self.closed_reason: str | None = None  #: why the session ended; None while it is open
         self.receiver = 0  #: identity of the receiving thread
-        self.look_ns = 0  #: time at which the supervisor next evaluates the session's state
+        self.check_ns = 0  #: time at which the supervisor next evaluates the session's state
         self._end = dial(self)  # must be last, because packets may arrive immediately
         self._same_clock = self._end.same_clock
         self.monitor.excuse(self._end.excused_s)
@@ -184,13 +184,12 @@ class ProxySession:
         self.requests.fail(error)
 
     @property
-    def variants(self) -> bool:
+    def adapts_frames(self) -> bool:
         """Whether frames arrive in the requested form; see :class:`skyloop.transport.base.TransportClient`."""
         return self._end.variants
 
     @property
     def address(self) -> str:
-        """Human-readable address of the proxy."""
         return self._end.address
 
     # Sending ---------------------------------------------------------------------------------------------------
@@ -216,7 +215,7 @@ class ProxySession:
     def subscribe(self, topic: str, on: bool) -> None:
         """Subscribe to or unsubscribe from a topic. Video that several requests share is subscribed to only once."""
         if topic.startswith(_VIDEOS):
-            carrier = _carrier(topic, variants=self.variants)
+            carrier = _carrier(topic, adapted=self.adapts_frames)
             users = self._video_users.setdefault(carrier, set())
             had_users = bool(users)
             (users.add if on else users.discard)(topic)
@@ -233,9 +232,9 @@ class ProxySession:
     def tick(self, now_ns: int) -> None:
         """Repeat due requests; ping the proxy if nothing arrives from it or its clock needs measuring."""
         self.requests.tick(now_ns)
-        late_ns = self.monitor.late_ns  # time without data before the proxy is pinged
+        late_ns = self.monitor.late_ns
         silent = now_ns - self.monitor.received_ns > late_ns
-        usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
+        usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST_TRIPS else _PING_FIRST_NS
         due = now_ns - self._pinged_ns > (late_ns if silent else usual_ns) and not self._pinged
         if (silent or not self._same_clock) and due:
             self._pinged_ns = now_ns
@@ -246,7 +245,7 @@ class ProxySession:
     def renew_feedback(self, now_ns: int) -> None:
         """Resubscribe to feedback if none arrives although the proxy answers.
 
-        If only a reduced rate was requested, plain feedback replaces it for the rest of this session, because the proxy
+        If only a reduced rate was requested, every sample is requested for the rest of this session, because the proxy
         may be too old or have no room for more variants. Consumers filter their samples in any case.
         """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
@@ -255,7 +254,7 @@ class ProxySession:
             return
         self._end.subscribe(self._feedback.topic, False)
         self._only_plain = self._only_plain or not self._feedback.is_plain
-        self._expect(PLAIN)
+        self._expect(EVERY_SAMPLE)
         self._end.subscribe(FEEDBACK)
 
     def _expect(self, request: FeedbackRequest) -> None:
@@ -340,15 +339,15 @@ def frame_size(header: FrameHeader) -> int:
     return header.size if channels is None else header.width * header.height * channels
 
 
-def _carrier(topic: str, *, variants: bool) -> str:
+def _carrier(topic: str, *, adapted: bool) -> str:
     """Return the transport topic that carries the video of ``topic``.
 
-    ``variants``: whether the transport delivers frames in the requested form. If not, all frames arrive unchanged, and
-    each channel filters and scales them.
+    ``adapted``: whether frames arrive in the requested form. If not, all frames arrive unchanged, and each channel
+    filters and scales them.
     """
     request = VideoRequest.parse(topic)
     if topic.startswith(stream("")):
         return topic
-    if not variants:
+    if not adapted:
         return request.plain.topic
     return request.stream_topic if request.encoding == "h264" else topic

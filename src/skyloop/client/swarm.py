@@ -54,7 +54,7 @@ Missing = Literal["raise", "skip"]
 
 _WILD: Final = frozenset("*?[")  #: characters that turn a name into a pattern
 _THERE: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
-_ROUNDING_S: Final = 1e-6
+_ROUNDING_S: Final = 1e-6  #: tolerance for the rounding errors of a sum of periods
 _log = logging.getLogger("skyloop")
 
 
@@ -401,8 +401,7 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of its drone, and send all of them at the same time.
 
-        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see
-        :meth:`hover`). :attr:`spread` is the time between the first and the last command.
+        Drones that are set aside are skipped. A hover doesn't take a drone from someone else (see :meth:`hover`).
 
         Args:
             actions: Actions by drone name.
@@ -412,7 +411,7 @@ class Swarm:
 
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names; nothing is sent in that case.
-            UsageError: If an action can't be commanded or contains numbers that are not finite; nothing is sent then.
+            UsageError: If an action can't be commanded or has a number that is not finite; nothing is sent.
             SwarmError: Depending on ``on_error``.
             ClosedError: If the swarm was closed.
         """
@@ -567,7 +566,7 @@ class Swarm:
 
     @property
     def spread(self) -> Distribution | None:
-        """Time between the first and the last command of the last :meth:`send` [s]; None before the first call."""
+        """Times between the first and the last command of each :meth:`send` [s], over the last 1024; None if none."""
         return distribution(np.frombuffer(bytes(self._spreads_ns), np.int64))
 
     # Failures ------------------------------------------------------------------------------------------------------
@@ -701,7 +700,7 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 def end_flights(drones: Mapping[str, Drone]) -> dict[str, Exception]:
     """End the flights of all drones at the same time and close the drones; return the errors by name.
 
-    Ctrl-C stops waiting for the landings, but each drone is still told to land, and lands without this program.
+    Ctrl-C stops waiting for the landings, but each drone is still commanded to land, and lands without this program.
     """
     return _problems(drones, lambda drone: drone._piloting.end_flight())
 

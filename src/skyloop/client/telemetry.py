@@ -37,10 +37,10 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.messages.feedback import OverviewPages
-from skyloop.messages.subscription import PLAIN, RateLimiter
+from skyloop.messages.subscription import EVERY_SAMPLE, RateLimiter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW
 
-RECENT_EVENTS: Final = 256
+RECENT_EVENTS: Final = 256  #: number of events kept for :meth:`skyloop.Drone.recent_events`
 #: A condition to wait for: a flight state or its name, several of them (any one suffices), or a test of feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
 T = TypeVar("T")
@@ -118,20 +118,19 @@ class Mailboxes:
 class FeedbackDemand:
     """Subscribes to the variant of feedback that satisfies all consumers of a drone.
 
-    A pilot always gets every sample in full, because samples report its link, its authority and failsafes. An observer
-    does too, until a consumer limits its request, or whenever a consumer needs every sample. Each connection uses one
-    variant.
+    A pilot always gets every sample, because samples report its link, its authority and failsafes. So does an observer
+    unless it has consumers and all of them have limited their rate.
     """
 
     def __init__(self, connection: ProxyConnection, *, whole: bool) -> None:
-        """Subscribe to every sample; with ``whole``, the subscription never changes afterwards."""
+        """Subscribe to every sample; with ``whole``, the subscription never changes."""
         self._connection = connection
         self._whole = whole
         self._wanted: dict[FeedbackRequest, int] = {}  # number of consumers of each request
         self._kept: set[FeedbackRequest] = set()  # permanent requests
         self._lock = threading.Lock()
-        self.request = PLAIN  #: the current subscription
-        connection.subscribe(PLAIN.topic)
+        self.request = EVERY_SAMPLE  #: the current subscription
+        connection.subscribe(EVERY_SAMPLE.topic)
 
     def want(self, request: FeedbackRequest, on: bool) -> None:
         """Add or remove a consumer of this request."""
@@ -162,7 +161,7 @@ class FeedbackDemand:
     def _update(self) -> None:
         """Change the subscription if the requests need a different one. The caller must hold the lock."""
         asked = [*self._wanted, *self._kept]
-        needed = PLAIN if self._whole or not asked else reduce(FeedbackRequest.union, asked)
+        needed = EVERY_SAMPLE if self._whole or not asked else reduce(FeedbackRequest.union, asked)
         before = self.request
         if needed != before:
             self.request = needed
@@ -207,7 +206,7 @@ class ClientState:
         self.counter = ChannelCounter()  #: counts feedback
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
-        self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(PLAIN, on))
+        self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(EVERY_SAMPLE, on))
         self.selected: tuple[FeedbackChannel, ...] = ()  #: channels for consumers with a limited request
         self.on_event: Channel[Event] = Channel()
         self.on_link: Channel[LinkStatus] = Channel()
@@ -246,7 +245,6 @@ class ClientState:
             self.to_close.remove(mailbox.close)
 
     def forget(self, listener: Listener[Any]) -> None:
-        """Forget a cancelled listener."""
         if listener in self.listeners:
             self.listeners.remove(listener)
 
@@ -290,7 +288,7 @@ class ClientState:
                 malformed=self._connection.malformed,
             ),
         }
-        for channel in tuple(self.video.variants.values()):
+        for channel in tuple(self.video.by_topic.values()):
             found[channel.name] = channel.stats(now_ns)
         for results in self.results.all():
             found[results.name] = results.stats(now_ns)
@@ -299,7 +297,7 @@ class ClientState:
     def wake_all(self) -> None:
         """Wake every waiting thread to make it check its condition again."""
         self.notifier.notify()
-        for channel in tuple(self.video.variants.values()):
+        for channel in tuple(self.video.by_topic.values()):
             channel.notifier.notify()
         for results in self.results.all():
             results.notifier.notify()
@@ -390,7 +388,6 @@ class SessionSamples:
             state.set_status(replace(status, vehicle=sample.vehicle_link, reason=reason, remedy=remedy))
 
     def _event(self, event: Event, now_ns: int) -> None:
-        """Store and publish an event."""
         self._state.recent.append(event)
         if event.kind is EventKind.PARAMETER_CHANGED:
             if event.data.get("app_id") != self._commands.app_id:

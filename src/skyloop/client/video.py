@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 MOST_WAITING: Final = 6
 IDLE_KEPT: Final = 32  #: maximum number of channels of each kind to keep; beyond this, unread channels are forgotten
 ASK_AGAIN_NS: Final = 300_000_000  #: how long to wait for a key frame before requesting it again
-_IDLE_S: Final = 2.0
+_IDLE_S: Final = 2.0  #: time without frames after which a decoding thread ends
 _PURPOSE: Final = "reading H.264"
 
 
@@ -82,6 +82,7 @@ class VideoChannel(Channel[Arrival]):
         self.counter = ChannelCounter()
         self.undecodable = 0
         self.too_old = 0  #: number of frames rejected because they exceeded a consumer's ``max_age_s``
+        # A camera that misses five frames has stalled, but a fast camera gets a second.
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
         chosen = self.request.part is not None or self.request.max_fps is not None
         #: Selects the frames for this request from the full stream; None if the request includes all frames.
@@ -139,7 +140,6 @@ class VideoChannel(Channel[Arrival]):
         self.watch.received_ns = now_ns
 
     def stats(self, now_ns: int) -> ChannelStats:
-        """Return the statistics at ``now_ns``."""
         return self.counter.stats(now_ns, dropped=self.dropped + self.too_old, malformed=self.undecodable)
 
     def _period_s(self, fps: float) -> float:
@@ -168,14 +168,14 @@ class StreamChannel(Channel[EncodedFrame]):
         picture = self._pieces.add(part)
         if picture is None:
             return
-        if self.decoder is not None and self._connection.variants:  # without variants, frames arrive unchanged
+        if self.decoder is not None and self._connection.adapts_frames:  # otherwise, frames arrive unchanged
             self.decoder.put(picture)
         self.publish(picture)
 
     def report(self, seq: int, *, wants_key: bool = False) -> None:
         """Report the newest frame to the proxy, which adapts its rate to the path accordingly. Thread-safe.
 
-        ``wants_key``: whether a missing frame prevents decoding; such reports are limited to a few a second.
+        ``wants_key``: whether a missing frame prevents decoding; a key frame is requested at most every 0.3 s.
         """
         if not self._encoded_here:
             return
@@ -188,7 +188,7 @@ class StreamChannel(Channel[EncodedFrame]):
 
 
 class StreamDecoder:
-    """Decodes one stream, in order, in a thread of its own. After an undecodable frame, it skips to the next key frame.
+    """Decodes one stream, in order, on its own thread. After an undecodable frame, it skips to the next key frame.
 
     ``deliver`` is called on that thread with each image's header, pixels (BGR) and arrival time [ns].
     """
@@ -216,7 +216,7 @@ class StreamDecoder:
                 self._waiting.clear()
             elif follows and len(self._waiting) >= MOST_WAITING:
                 self._chain.restart()
-                follows = False
+                follows = False  # decoding has fallen behind: skip to the next key frame
             if follows:
                 self._waiting.append((picture, self._clock()))
                 if not self._running:
@@ -281,7 +281,7 @@ class VideoChannels:
 
     def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
         self.channels: dict[str, VideoChannel] = {}  #: channels for the default request, by camera
-        self.variants: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
+        self.by_topic: dict[str, VideoChannel] = {}  #: all channels, keyed by the topic of their request
         self.streams: dict[str, StreamChannel] = {}  #: by topic
         self.subscriber = secrets.token_hex(8)  #: identifies streams whose rate is adapted to the path of this client
         self._connection = connection
@@ -338,16 +338,16 @@ class VideoChannels:
         """Return the channel of a camera's frames as requested (None: :func:`usual`); create it on the first call."""
         topic = (request or usual(camera.name)).topic
         with self._making:
-            channel = self.variants.get(topic)
+            channel = self.by_topic.get(topic)
             if channel is None:
-                forget_idle(self.variants, keep=self.channels.values())
+                forget_idle(self.by_topic, keep=self.channels.values())
                 channel = VideoChannel(camera, self._connection, self._scheduler, self._history, request)
                 if channel.request.encoding == "h264":
                     encoded, deliver = self._made_stream(channel.request), partial(channel.receive, as_asked=True)
                     encoded.decoder = StreamDecoder(
                         encoded, deliver, self._scheduler.clock, f"skyloop-decode-{camera.name}"
                     )
-                self.variants[topic] = channel
+                self.by_topic[topic] = channel
         return channel
 
     def _made_stream(self, request: VideoRequest) -> StreamChannel:
@@ -356,21 +356,21 @@ class VideoChannels:
         with self._making:
             channel = self.streams.get(topic)
             if channel is None:
-                decoded = [one.request for one in self.variants.values() if one.request.encoding == "h264"]
+                decoded = [one.request for one in self.by_topic.values() if one.request.encoding == "h264"]
                 forget_idle(self.streams, keep={self.streams.get(one.stream_topic) for one in decoded})
                 channel = self.streams[topic] = StreamChannel(topic, self._connection, self._scheduler.clock)
         return channel
 
     def connected(self, cameras: Iterable[CameraInfo], now_ns: int) -> None:
         """Store the cameras of a newly connected proxy, which may count its frames from 0."""
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             channel.restart(now_ns)
         # The proxy may have restarted with different cameras, and its first camera may be a different one.
         self.channels = {one.name: self.channels.get(one.name) or self.made(one) for one in cameras}
 
     def renew(self, flows: bool, now_ns: int) -> None:
         """Resubscribe to cameras that have stalled while other samples still arrive (``flows``)."""
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
 
@@ -380,17 +380,16 @@ class VideoChannels:
         ``topic`` names the request that the frame answers; empty: a plain frame of the camera, for all its channels.
         """
         if topic:
-            channel = self.variants.get(topic)
+            channel = self.by_topic.get(topic)
             if channel is not None:
                 channel.receive(header, pixels, now_ns, as_asked=True)
             return
-        for channel in tuple(self.variants.values()):
+        for channel in tuple(self.by_topic.values()):
             mine, chosen = channel.subscribed and channel.camera.name == header.camera, channel.filter
             if mine and (chosen is None or chosen.wants(header.seq, header.captured_ns)):
                 channel.receive(header, pixels, now_ns, as_asked=False)
 
     def receive_encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (the signature of all handlers)
-        """Deliver a frame of an encoded stream."""
         channel = self.streams.get(picture.topic or stream(picture.camera))
         if channel is not None:
             channel.receive(picture)

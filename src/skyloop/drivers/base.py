@@ -184,8 +184,7 @@ class ExternalPose:
     def bounded(self, now_ns: int) -> ExternalPose:
         """Return the pose with its time limited to the present, which drivers require.
 
-        Raises :class:`DriverError` if the time is more than 50 ms ahead: its clock is wrong, and later poses would look
-        old.
+        Raises :class:`DriverError` if the time is more than 50 ms ahead: the clock behind it is wrong.
         """
         ahead_ns = self.captured_ns - now_ns
         if ahead_ns > AHEAD_NS:
@@ -374,7 +373,8 @@ class Driver(ABC):
     def checkup(self) -> list[Diagnostic]:
         """Return findings about the vehicle and its settings that need attention before a flight.
 
-        For ``skyloop doctor`` and ``drone.preflight()``. Called while the driver is open, on any thread; must not wait.
+        ``skyloop doctor`` and ``drone.preflight()`` show them. Called on any thread while the driver is open; must not
+        wait.
         """
         return []
 

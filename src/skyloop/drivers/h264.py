@@ -20,7 +20,7 @@ _SET_BYTES: Final = 512  # number of bytes that suffice for a sequence parameter
 _CHROMA_PROFILES: Final = frozenset({100, 110, 122, 244, 44, 83, 86, 118, 128})
 _ALL_COLOURS: Final = 3  # chroma_format_idc for 4:4:4
 _MAX_BLOCKS: Final = 1024  # maximum number of macroblocks per side (16384 pixels)
-_MAX_CYCLE: Final = 255
+_MAX_CYCLE: Final = 255  # largest num_ref_frames_in_pic_order_cnt_cycle
 _B: Final = 1  # slice_type of B slices, modulo 5
 
 
@@ -48,7 +48,7 @@ class Slice:
 
 
 def units(stream: bytes) -> list[bytes]:
-    """Split data of a stream in Annex B format into its NAL units. Bytes before the first start code are skipped."""
+    """Split data in Annex B format into NAL units; bytes before the first start code are skipped."""
     return [unit.rstrip(b"\0") for unit in _ANY_START.split(stream)[1:] if unit.rstrip(b"\0")]
 
 
@@ -57,19 +57,19 @@ def unit_type(unit: bytes) -> int:
 
 
 def parse_sequence(unit: bytes) -> Sequence:
-    """Parse a sequence parameter set. Raises :class:`DecodeError`."""
+    """Parse a sequence parameter set (7.3.2.1.1). Raises :class:`DecodeError`."""
     bits = _Bits(unit[1:_SET_BYTES])
     profile = bits.take(8)
-    bits.take(16)
-    bits.exp_golomb()
+    bits.take(16)  # constraint flags and level
+    bits.exp_golomb()  # number of this set
     chroma, planes = 1, False
     if profile in _CHROMA_PROFILES:
         chroma = bits.exp_golomb()
         planes = chroma == _ALL_COLOURS and bool(bits.take(1))
-        bits.exp_golomb()
-        bits.exp_golomb()
-        bits.take(1)
-        if bits.take(1):
+        bits.exp_golomb()  # bit depth of luma
+        bits.exp_golomb()  # bit depth of chroma
+        bits.take(1)  # lossless transform bypass
+        if bits.take(1):  # scaling lists are present
             for number in range(12 if chroma == _ALL_COLOURS else 8):
                 if bits.take(1):
                     _skip_scaling_list(bits, 16 if number < 6 else 64)
@@ -83,10 +83,10 @@ def parse_sequence(unit: bytes) -> Sequence:
     if frame_number_bits > 16 or columns > _MAX_BLOCKS or rows > _MAX_BLOCKS or chroma > _ALL_COLOURS:
         raise DecodeError("impossible numbers in a sequence parameter set")
     if not frames_only:
-        bits.take(1)
-    bits.take(1)
+        bits.take(1)  # macroblock-adaptive frame/field coding
+    bits.take(1)  # direct_8x8_inference_flag
     width, height = columns * 16, rows * 16
-    if bits.take(1):
+    if bits.take(1):  # the image is cropped
         across = 2 if chroma in (1, 2) and not planes else 1
         down = (2 if chroma == 1 and not planes else 1) * (2 - frames_only)
         left, right, top, bottom = (bits.exp_golomb() for _ in range(4))
@@ -98,13 +98,13 @@ def parse_sequence(unit: bytes) -> Sequence:
 
 
 def parse_slice(unit: bytes, sequence: Sequence) -> Slice:
-    """Parse the start of a slice header. Raises :class:`DecodeError`."""
+    """Parse the start of a slice header (7.3.3). Raises :class:`DecodeError`."""
     bits = _Bits(unit[1:_HEADER_BYTES])
     first = bits.exp_golomb()
     kind = bits.exp_golomb()
     bits.exp_golomb()  # number of its parameter set
     if sequence.colour_planes:
-        bits.take(2)
+        bits.take(2)  # colour plane
     number = bits.take(sequence.frame_number_bits)
     return Slice(unit_type(unit) == IDR, first == 0, bool(unit[0] & 0x60), number, kind % 5 == _B)
 
@@ -165,7 +165,7 @@ class _Bits:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """An access unit with the findings of the inspector."""
+    """An access unit plus the inspector's findings."""
 
     data: bytes  #: the unit in Annex B format; if it is a key frame, it includes the parameter sets
     is_key: bool  #: whether decoding can start here: an IDR picture with known parameter sets
@@ -193,10 +193,9 @@ class Inspector:
             self._remember(unit)
 
     def inspect(self, data: bytes) -> Unit | None:
-        """Inspect the next access unit, in Annex B format.
+        """Inspect the next access unit, in Annex B format; return None if it contains no picture.
 
-        Returns None if the unit contains no picture, or if its headers are damaged or unknown. The next unit then
-        counts as following a gap.
+        Also returns None if the headers of its picture are damaged or unknown; the next unit then follows a gap.
         """
         found = units(data)
         kinds = {unit_type(unit) for unit in found}

@@ -65,7 +65,7 @@ class ContainerStream:
 
     Args:
         name: An address or a path for FFmpeg, or the content of a file.
-        format_name: FFmpeg's name of the format; None: FFmpeg detects it.
+        format_name: FFmpeg's name for the format; None lets FFmpeg detect it.
         open_s: Time limit for connecting, the handshake and finding the image size [s]; a hanging device takes longer.
         read_s: Time limit for the next frame [s]. FFmpeg can't be interrupted, and :meth:`read` may take this long.
 
@@ -132,7 +132,7 @@ class ContainerStream:
         self._arrivals.append(now_ns)
         unit = self._units.of(packet)
         captured_ns = min(self._captured_ns(packet), now_ns)
-        if self._units.in_order:  # timestamps that arrive later must not set the time back
+        if self._units.in_order:  # a new estimate of the delay must not set the time back
             captured_ns = self._captured_newest_ns = max(captured_ns, self._captured_newest_ns)
         units = self._units
         piece = Piece(packet, self._context, self._number, unit, units.reason, not units.in_order)
@@ -141,7 +141,6 @@ class ContainerStream:
         return [Coded(piece, is_key, captured_ns, now_ns, self._connection)]
 
     def close(self) -> None:
-        """Close the connection."""
         self._container.close()
 
     def _chosen(self) -> tuple[VideoCodecContext, Iterator[av.Packet[av.VideoStream]]]:
@@ -188,7 +187,7 @@ class Units:
         self._inspector = Inspector(parameters)
 
     def of(self, packet: av.Packet[av.VideoStream]) -> Unit | None:
-        """Return a packet's frame, if it contains one. Set ``reason`` when the first frame can't be forwarded."""
+        """Return a packet's frame, if it contains one. Set ``reason`` once a frame can't be forwarded."""
         if not self._is_h264:
             return None
         data = self._annex_b(packet)
@@ -247,7 +246,6 @@ class LiveDecoder:
         self._captured: dict[tuple[bool, int | None], int] = {}
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """See :class:`skyloop.drivers.live_video.Decoder`."""
         piece = coded.data
         if not isinstance(piece, Piece):
             raise TypeError("expected a piece of a live stream")

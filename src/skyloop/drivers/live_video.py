@@ -26,10 +26,10 @@ from skyloop.messages.frame import Chain
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: pauses between connection attempts [s]; the last one repeats
 REFUSALS: Final = 3  #: number of consecutive unsupported frames before this is reported; a flipped bit may cause one
-_CLOSE_S: Final = 2.0
+_CLOSE_S: Final = 2.0  #: how long to wait for each thread to end
 LATE_NS: Final = 50_000_000  #: a frame that has waited longer than this is late
 KEYLESS: Final = 600  #: number of frames without a key frame before the stream is reported as not forwardable
-MAX_FRAMES: Final = 120  #: 4 s of video; vehicles send key frames every half second or second
+MAX_FRAMES: Final = 120  #: 4 s of video at 30 frames/s; vehicles send a key frame every half second or second
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class Coded:
     is_key: bool  #: whether decoding can start at this frame
     captured_ns: int  #: capture time, on this host's clock
     arrived_ns: int
-    connection: int  #: increases with each connection; frames never depend on frames of other connections
+    connection: int  #: number of the connection; frames never depend on frames of other connections
 
 
 class FrameBacklog:
@@ -157,7 +157,7 @@ class VideoEvent(Enum):
 
     STREAMING = "streaming"  #: frames are arriving
     LOST = "lost"  #: the connection was lost or is not established yet; reported once per reason, retried forever
-    UNSUPPORTED = "unsupported"  #: frames use another codec, or the data is invalid; reported once per series
+    UNSUPPORTED = "unsupported"  #: frames use an unsupported codec, or the data is invalid; reported once per series
     FAULT = "fault"  #: an error in this program, reported once; the video continues
 
     def publish(self, sink: Sink, where: str, text: str) -> None:
@@ -200,7 +200,8 @@ class LiveVideo:
 
     Args:
         place: Human-readable description of where the video comes from.
-        connect: Opens a connection, given its number from 0; raises OSError on failure. On the reading thread.
+        connect: Opens a connection, given the number of earlier ones that delivered frames; raises OSError on failure.
+            Called on the reading thread.
         make_decoder: Creates the decoder; raises MissingExtraError if no decoder is installed. Called on the thread
             that calls :meth:`start`.
         show: Called with each frame on the decoding thread; must return quickly.
@@ -419,8 +420,8 @@ class StreamRelay:
     ) -> bool:
         """Forward an undamaged frame if it is wanted and decodable after the last one; return whether it was forwarded.
 
-        ``captured_ns`` is the capture time of the decoded frame, too. ``number`` counts the frames received on the
-        connection; skipped frames appear as gaps. ``picture``: False if the unit contains only parameter sets; these
+        ``captured_ns`` is also the capture time of the decoded frame. ``number`` counts the frames received on the
+        connection; skipped frames appear as gaps. ``picture``: False if the unit contains only parameter sets, which
         are not forwarded.
         """
         if not self.wanted(camera):
@@ -460,7 +461,7 @@ class CheckedRelay:
 
     @property
     def wanted(self) -> bool:
-        """Whether anyone wants the stream at present."""
+        """Whether anyone currently wants the stream."""
         return self._relay.wanted(self._camera)
 
     def take(self, unit: Unit | None, reason: str, captured_ns: int, *, number: int, connection: int) -> None:

@@ -151,18 +151,15 @@ class RecordingSink:
             self._notify()
 
     def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (all cameras or none)
-        """Return ``record``."""
         return self.record
 
     def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
-        """Record a state of the link and its reason."""
         with self._changed:
             self.links.append((LinkState(state), reason))
             self.remedy = remedy
             self._notify()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Store an event."""
         with self._changed:
             self.events.append(VehicleEvent(EventKind(kind), text, Severity(severity), data))
             self._notify()

@@ -59,7 +59,7 @@ from skyloop.messages.geometry import wrap_angle
 
 __all__ = ["DriverSuite", "RecordingSink"]
 
-APPLY_S: Final = 0.05
+APPLY_S: Final = 0.05  #: maximum median time that a call of ``apply`` may take [s]
 NEAR_RAD: Final = 0.3  #: tolerance for the commanded heading [rad]
 #: Returns the signed distance that the vehicle moved between two samples; None if the vehicle does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
@@ -69,9 +69,9 @@ _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 class DriverSuite:
     """Base class for the tests of a driver. Set :attr:`uri` or override :meth:`make`; everything else has a default.
 
-    For a vehicle that is slower or moves less, override the class attributes below. To test the loss of the link,
-    override :meth:`vehicle_disappears` and :meth:`vehicle_appears`. To give each test a fake vehicle of its own, start
-    it in a fixture and override :meth:`new_driver`.
+    For a vehicle that is slower or moves less, override the class attributes below. To test link loss, override
+    :meth:`vehicle_disappears` and :meth:`vehicle_appears`. To give each test its own fake vehicle, start it in a
+    fixture and override :meth:`new_driver`.
     """
 
     uri: ClassVar[str] = ""  #: address of the vehicle to use
@@ -101,27 +101,18 @@ class DriverSuite:
     # To be implemented or overridden by a driver's test ------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
-        """Return a new, unopened driver. By default, the entry point of the URI's scheme gives the class.
+        """Return a new, unopened driver; by default, of the class that the entry point for the URI's scheme names.
 
-        Args:
-            uri: Address of the vehicle to use; it may include an option that must be refused.
+        The address may include an option that the driver must refuse.
         """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Make the vehicle of the open driver disappear: switch off its radio, or stop its emulator.
-
-        Raises:
-            unittest.SkipTest: Unless overridden.
-        """
+        """Make the vehicle of the open driver disappear: switch off its radio, or stop its emulator."""
         raise unittest.SkipTest("this suite does not know how to make the vehicle disappear")
 
     def vehicle_appears(self) -> None:
-        """Make the vehicle reachable again.
-
-        Raises:
-            unittest.SkipTest: Unless overridden.
-        """
+        """Make the vehicle reachable again."""
         raise unittest.SkipTest("this suite does not know how to make the vehicle appear")
 
     # Helpers -------------------------------------------------------------------------------------------------------
@@ -134,16 +125,8 @@ class DriverSuite:
     def opened(self, *, watch: set[str] | None = None, record: bool = False) -> Iterator[tuple[Driver, RecordingSink]]:
         """Open a driver with a checking sink, wait until its link is up, and close the driver at the end.
 
-        Args:
-            watch: Names of the cameras whose frames are wanted; None: all cameras.
-            record: Whether encoded frames are wanted.
-
-        Yields:
-            The open driver and its sink.
-
-        Raises:
-            AssertionError: If the link was not UP within :attr:`connect_timeout_s`, or if the driver broke the contract
-                of :class:`skyloop.drivers.base.Sink`.
+        ``watch`` and ``record`` are those of :class:`RecordingSink`. Fails if the link is not up within
+        :attr:`connect_timeout_s`, or if the driver breaks the contract of :class:`skyloop.drivers.base.Sink`.
         """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
         driver.open(sink)
@@ -488,14 +471,7 @@ class DriverSuite:
             flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
 
     def wait_for_feedback(self, sink: RecordingSink) -> None:
-        """Wait for the first feedback.
-
-        Args:
-            sink: The open driver's sink.
-
-        Raises:
-            AssertionError: If no feedback arrived within :attr:`feedback_timeout_s`.
-        """
+        """Wait for the first feedback; fail if none arrives within :attr:`feedback_timeout_s`."""
         received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"
 
@@ -536,7 +512,7 @@ class Flight:
         suite.wait_for_feedback(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
-        """Wait until the newest feedback meets a condition, and return it; the error is "not ``what`` within"."""
+        """Wait until the newest feedback meets a condition, and return it; ``what`` names the condition in errors."""
         sink = self.sink
 
         def holds() -> bool:
@@ -648,8 +624,8 @@ def _summary(feedback: Feedback | None) -> str:
         return "none"
     age_s = (time.monotonic_ns() - feedback.captured_ns) / 1e9
     values = {name: getattr(feedback, name) for name in (*PLAUSIBLE, "native")}
-    told = [f"{name} {value}" for name, value in values.items() if value is not None]
-    return ", ".join([f"state {feedback.state.name}", f"{age_s:.2f} s old", *told])
+    known = [f"{name} {value}" for name, value in values.items() if value is not None]
+    return ", ".join([f"state {feedback.state.name}", f"{age_s:.2f} s old", *known])
 
 
 def _height(start: Feedback, now: Feedback) -> float | None:

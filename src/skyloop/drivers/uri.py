@@ -86,7 +86,7 @@ class VehicleUri:
         return self._given[2] or f"{self.scheme}://{self._given[0]}"
 
     def scrub(self, text: str) -> str:
-        """Hide the secrets of this address in a text, such as a library's error message."""
+        """Hide the secrets of this address in other text, such as a library's error message."""
         for given, shown in self._secrets:
             if len(given) < _SHORT_SECRET:  # hiding it within words would hide too much, and thereby reveal it
                 text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(given)}(?![A-Za-z0-9])", HIDDEN, text)
@@ -95,16 +95,9 @@ class VehicleUri:
         return text
 
     def number(self, option: str, default: float, *, minimum: float = -math.inf, maximum: float = math.inf) -> float:
-        """Return an option as a finite number within a range.
+        """Return an option as a finite number from ``minimum`` to ``maximum``; ``default`` if it is not given.
 
-        Args:
-            option: Name of the option.
-            default: Value to return if the option is not given; not checked against the range.
-            minimum: Smallest allowed value.
-            maximum: Largest allowed value.
-
-        Raises:
-            UsageError: If the option is not a finite number within the range.
+        Raises :class:`UsageError` for any other value. The default is not checked.
         """
         given = self.reveal(option)
         if given is None:
@@ -130,7 +123,7 @@ class VehicleUri:
     def flag(self, option: str, default: bool = False) -> bool:
         """Return an option as a bool: ``1``, ``true``, ``yes`` or only the name, or ``0``, ``false`` or ``no``.
 
-        Raises :class:`UsageError` for any other value. If the option is not given, ``default`` is returned.
+        Returns ``default`` if it is not given. Raises :class:`UsageError` for any other value.
         """
         given = self.options.get(option)
         if given is None:

@@ -26,7 +26,7 @@ from skyloop.messages import AnyAction, EventKind, Severity
 NAME_WAIT_S: Final = 0.2  #: time within which most name look-ups finish
 PAUSE_S: Final = 0.03  #: pause after an error
 RENEW_NS: Final = nanoseconds(2.0)  #: how often to renew sockets that receive nothing; this host may have a new address
-MAX_DATAGRAM: Final = 65_536
+MAX_DATAGRAM: Final = 65_536  #: size of the receive buffer [bytes], more than any UDP datagram needs
 BURST: Final = 32  #: maximum number of datagrams to read before commands are sent
 
 S = TypeVar("S", bound=VehicleSession)
@@ -42,10 +42,9 @@ class Readable(Protocol):
 
 
 class NameLookup:
-    """Looks up host names in its own thread: without a network, a resolver often takes 10 s.
+    """Looks up one host name at a time, in its own thread: without a network, a resolver often takes 10 s.
 
-    It looks up one host at a time. Not thread-safe. :meth:`address` may block for ``wait_s``, which is 0 on a thread
-    that also serves other links.
+    Not thread-safe. ``wait_s`` must be 0 on a thread that also serves other links.
     """
 
     def __init__(self, family: socket.AddressFamily = socket.AF_INET, wait_s: float = NAME_WAIT_S) -> None:
@@ -59,7 +58,7 @@ class NameLookup:
         return self._asking is not None and self._asking.done()
 
     def address(self, host: str) -> str:
-        """Return the first address of a host. Blocks for up to ``wait_s``."""
+        """Return the first address of a host, or raise ``OSError`` if it is not known within ``wait_s``."""
         try:
             return str(ipaddress.ip_address(host))
         except ValueError:
@@ -262,12 +261,12 @@ class VehicleLink(ABC, Generic[S]):
             with self.lock:
                 self.session.failed(error)
 
-    def _step(self, *, wait: bool = True, look: bool = True) -> None:
+    def _step(self, *, wait: bool = True, poll: bool = True) -> None:
         self._renew()  # renew sockets before waiting; none is then closed between becoming readable and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
             wait_ns = self._awake_ns - self._clock() if wait else 0
-        for key, _ in self._selector.select(max(0.0, seconds(wait_ns))) if look else ():
+        for key, _ in self._selector.select(max(0.0, seconds(wait_ns))) if poll else ():
             key.data()
         with self.lock:
             now_ns = self._clock()
@@ -313,7 +312,7 @@ class VehicleLink(ABC, Generic[S]):
             return None
         self._within = threading.get_ident()
         try:
-            self._step(wait=False, look=readable)
+            self._step(wait=False, poll=readable)
         except Exception as error:
             self._deliver([partial(_report_failure, error)])
             raise
@@ -355,7 +354,7 @@ class ConnectionLink(VehicleLink[S], Generic[S, C]):
 
     @abstractmethod
     def _read(self, connection: C) -> None:
-        """Pass the received data to the session. On the link's thread, with the lock free.
+        """Pass the received data to the session. Called on the link's thread, without the lock.
 
         Raises ``OSError`` if the connection has ended.
         """

@@ -43,7 +43,7 @@ class LinkTimeouts:
 
     degraded_ns: int
     lost_ns: int
-    first_word_ns: int  #: time after opening before a vehicle that has sent no data is reported as lost
+    first_data_ns: int  #: time after opening before a vehicle that has sent no data is reported as lost
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +105,14 @@ class RestartWatch:
 
     def _step(self, before: int, number: int) -> int:
         step = number - before
+        # Numbers that wrap jump by nearly the whole range. A smaller jump back is a late packet or a restart.
         if abs(step) < 0.99 * self._wrap or not self._wrap:
             return step
         return step + self._wrap if step < 0 else step - self._wrap
 
 
-#: While nothing is received, a request is kept, or sent repeatedly, for this long after its last repeat. An application
-#: that still wants the request keeps repeating it. Otherwise, the request might interfere with another application's
-#: flight.
+#: If nothing is received, a request is kept (or keeps being sent) for this long after its last repeat. Applications
+#: repeat what they still want; without this limit, an old request could interfere with another application's flight.
 KEPT_NS: Final = nanoseconds(3.0)
 
 
@@ -171,7 +171,7 @@ class VehicleSession(ABC):
             self._lose(f"the connection failed: {self._unreachable}", now_ns)
 
     def drain(self) -> list[SinkCallback]:
-        """Return the callbacks for the sink that were added since the last call, in order."""
+        """Remove and return the callbacks for the sink, in order."""
         for event in self._new_events():
             self._publish_event(event)
         pending, self._pending = self._pending, []
@@ -217,7 +217,7 @@ class VehicleSession(ABC):
             self._landing_ns = None
             if self._forget_landing():
                 text = (
-                    f"the landing was abandoned: the vehicle was silent for {seconds(KEPT_NS):g} s since the  "
+                    f"the landing was abandoned: the vehicle was silent for {seconds(KEPT_NS):g} s since the "
                     "last request: land it again when it is back"
                 )
                 self._publish_event(message(text, "landing_given_up", Severity.ERROR))
@@ -226,7 +226,7 @@ class VehicleSession(ABC):
         self._check_landing(now_ns)
         patience = self.TIMEOUTS
         if self._received_ns is None:
-            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= patience.first_word_ns:
+            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= patience.first_data_ns:
                 self._reported_ns = now_ns
                 self._set_link_state(LinkState.LOST, self._silence_text())
             elif self._unreachable != self._reported_reason and now_ns - self._reported_ns >= REPORT_AGAIN_NS:
@@ -338,7 +338,7 @@ class MotorStop:
         self._give_up = give_up
         self._begun_ns: int | None = None  # time of the first press
         self._pressed_ns = 0  # time of the newest press, without repeats
-        self._heard_ns = 0  # time of the newest press or repeat
+        self._asked_ns = 0  # time of the newest press or repeat
         self._sent_ns: int | None = None
         self._shown = self._was_shown = False
 
@@ -357,12 +357,12 @@ class MotorStop:
         if self._begun_ns is None:
             self._begun_ns, self._sent_ns, self._shown, self._was_shown = now_ns, None, False, False
             self._pressed_ns = now_ns
-        elif now_ns - self._heard_ns >= AGAIN_NS:
+        elif now_ns - self._asked_ns >= AGAIN_NS:
             self._pressed_ns = now_ns
-        self._heard_ns = now_ns
+        self._asked_ns = now_ns
 
     def settled(self, seen_ns: int) -> bool:
-        """Return whether the vehicle must have sent a report received at ``seen_ns`` after the press."""
+        """Return whether a report received at ``seen_ns`` must have been sent after the press."""
         return self._begun_ns is not None and seen_ns - self._begun_ns >= SETTLE_NS
 
     def step(self, shown: bool | None, now_ns: int) -> bool:
@@ -391,7 +391,7 @@ class MotorStop:
         Raises :class:`DriverError` if the vehicle has not confirmed the stop, which is then still being sent.
         """
         if self.active and not self.shown:
-            raise DriverError("the motors still run, or are still armed: the stop has not shown yet")
+            raise DriverError("the motors still run, or are still armed: the stop is not confirmed yet")
         self._begun_ns = None
 
     def _end_unshown(self) -> None:
@@ -400,7 +400,7 @@ class MotorStop:
             text = "the emergency stop is over: someone else reset the vehicle or started its motors again"
         else:
             text = (
-                f"the emergency stop has ended: the vehicle has not shown it for {seconds(GIVE_UP_NS):g} s, and may "
-                "fly: land it, or stop it again"
+                f"the emergency stop has ended: the vehicle has not confirmed it for {seconds(GIVE_UP_NS):g} s, and "
+                "may still be flying: land it, or stop it again"
             )
         self._give_up(message(text, "stop_given_up", Severity.ERROR))

@@ -20,6 +20,7 @@ from skyloop.messages.feedback import Event, Feedback, Overview
 from skyloop.messages.frame import EncodedFrame, FrameHeader, StreamReport
 from skyloop.messages.relayed import Annotation, LogEntry, ProcessorResult, ProcessorShare
 
+# The header of every packet, little-endian: signature, version, kind, reserved, body length (docs/wire-format.md).
 SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
 HEADER: Final = struct.Struct("<4sBBHI")
@@ -89,7 +90,7 @@ _KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}
 _pack_header = HEADER.pack
 _unpack_header = HEADER.unpack_from
 _unpack_length = struct.Struct("<I").unpack_from
-_PREFIX_SIZE: Final = 8
+_PREFIX_SIZE: Final = 8  #: bytes of the header before the body length
 _BY_PREFIX: Final = {
     _pack_header(SIGNATURE, VERSION, kind, 0, 0)[:_PREFIX_SIZE]: msgspec.msgpack.Decoder(sample).decode
     for sample, kind in KINDS.items()

@@ -21,7 +21,7 @@ MAX_YAW_RAD: Final = 1000.0  #: a yaw larger than this is also rejected [rad]
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
-    """Base class of the commands for a vehicle."""
+    """Base class of all actions that a command can request from a vehicle."""
 
     @property
     def name(self) -> str:
@@ -77,7 +77,7 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
     @property
     def finite(self) -> bool:
-        return math.isfinite(self.roll + self.pitch + self.climb + self.yaw_rate)
+        return math.isfinite(self.roll + self.pitch + self.climb + self.yaw_rate)  # NaN or infinite if any of them is
 
 
 class Velocity(Action, frozen=True, array_like=True, tag=7):
@@ -185,9 +185,7 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     intent: Count  #: increases with each request by the *application*; the library's repeats don't change it
     sent_ns: int  #: sending time on the proxy's clock; unbounded, because an emergency stop is always valid
     action: AnyAction
-    automatic: bool = (
-        False  #: whether the library itself requests it; then it never takes a vehicle that someone else is flying
-    )
+    automatic: bool = False  #: whether the library itself requests it; it then takes no vehicle that others are flying
 
 
 class Applied(msgspec.Struct, frozen=True, array_like=True):

@@ -12,12 +12,13 @@ from skyloop.messages.parameter import Parameter, ParameterName
 from skyloop.messages.relayed import MAX_CODE, ProcessorName
 
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
-LONGEST_TERM_S = 86_400.0
+LONGEST_TERM_S = 86_400.0  #: longest time for which the authority can be requested: a day
 Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
 MAX_REASON = 200  #: maximum length of a holder's reason for declining [characters]
 ClockName = Annotated[str, msgspec.Meta(max_length=64)]
 Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
+# Priorities of requests for the authority; a lower number is a higher priority.
 HIGHEST_PRIORITY = 0
 DEFAULT_PRIORITY = 16
 LOWEST_PRIORITY = 31
@@ -49,7 +50,7 @@ class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
 
     priority: Priority = DEFAULT_PRIORITY
     queue: bool = True  #: whether to queue if another application holds the authority; if False, the request is refused
-    for_s: Term | None = None  #: how long the application needs the authority [s]; nil: until it releases it
+    for_s: Term | None = None  #: how long the application needs the authority [s]; nil: until it is released
     takeover: Takeover = Takeover.NOW
 
 

@@ -155,7 +155,7 @@ class EarthOrigin(NamedTuple):
 
 
 def is_on_earth(latitude_deg: float, longitude_deg: float) -> bool:
-    """Return whether the position exists and is not a pole, where east is undefined; False for NaN."""
+    """Return whether the position exists and is not within 0.1° of a pole, where east is undefined; False for NaN."""
     return abs(latitude_deg) < 89.9 and abs(longitude_deg) <= 180.0
 
 
@@ -214,14 +214,14 @@ class Overview(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
 
 
 class OverviewPages:
-    """Assembles overviews from pages, in order of arrival."""
+    """Assembles overviews from pages that arrive in order."""
 
     def __init__(self) -> None:
         self._seq: int | None = None
         self._rows: list[VehicleOverview] = []
 
     def add(self, page: Overview) -> Overview | None:
-        """Add a page; return the overview if this was its last missing page, otherwise None.
+        """Add a page; return the overview if this page completes it.
 
         An incomplete overview is dropped, because the next one follows within a second.
         """

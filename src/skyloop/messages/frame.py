@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 H264: Final = "h264"  #: the only codec that is recorded without decoding
 #: Maximum number of bytes of a frame in one packet, which also contains the other fields.
 MAX_PIECE: Final = 57_000
-MAX_PIECES: Final = 64
+MAX_PIECES: Final = 64  #: maximum number of pieces of one frame
 MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a complete frame [bytes]
 Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
@@ -154,7 +154,7 @@ class Chain:
         self._last: int | None = None  # None while a key frame is awaited
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Return whether the next frame received, numbered ``seq``, can be decoded; False for duplicates."""
+        """Return whether frame ``number``, received next, can be decoded; only key frames may be repeated."""
         if number == self._last and not key:
             return False
         whole = key or (self._last is not None and number == self._last + 1)

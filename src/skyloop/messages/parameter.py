@@ -37,7 +37,7 @@ class Parameter(msgspec.Struct, frozen=True, array_like=True):
     minimum: float | None = None
     maximum: float | None = None
     default: Value | None = None
-    choices: tuple[Value, ...] = ()  #: the only allowed values; empty if others are allowed
+    choices: tuple[Value, ...] = ()  #: the only allowed values; empty: any value of the type and range
     read_only: bool = False
     description: str = ""
     momentary: bool = False  #: whether writing it triggers an action, such as a flip; it has no lasting value
@@ -82,7 +82,7 @@ def decode_checkup(text: str) -> list[Diagnostic]:
 # yaw is counter-clockwise [rad], and 0 faces east. It is only for display, never for control.
 
 WORLD: Final = "world.geometry"  #: the parameter's name
-MAX_WORLD_TEXT: Final = 8000  #: characters in the text, so that it fits into a parameter's packet
+MAX_WORLD_TEXT: Final = 8000  #: maximum length of the text [characters], which fits into a parameter's packet
 MAX_THINGS: Final = 256  #: maximum number of objects of each kind
 
 _Name = Annotated[str, msgspec.Meta(max_length=64)]
@@ -144,7 +144,7 @@ _world_decoder = msgspec.json.Decoder(WorldGeometry)
 
 
 def encode_world(world: WorldGeometry) -> str:
-    """Encode a world as a parameter's text; if the text gets too long, omit the last solids and markers."""
+    """Encode a world as a parameter's text; while the text is too long, omit the last quarter of the commonest kind."""
     while len(text := _encode_json(world).decode()) > MAX_WORLD_TEXT:
         kind = max(("solids", "markers", "gates", "starts"), key=lambda one: len(getattr(world, one)))
         things = getattr(world, kind)
@@ -155,5 +155,5 @@ def encode_world(world: WorldGeometry) -> str:
 
 
 def decode_world(text: str) -> WorldGeometry:
-    """Decode a world from a parameter's text. Raises ``ValueError`` if the text describes no world."""
+    """Decode a world from a parameter's text. Raises ``ValueError`` if the text doesn't describe one."""
     return _world_decoder.decode(text.encode())

@@ -64,6 +64,7 @@ class Annotation(msgspec.Struct, frozen=True, array_like=True):
 
 MAX_LOG_TEXT: Final = 4096  #: maximum length of a log entry's text [characters]
 MAX_VALUES: Final = 4096  #: maximum number of values in an array
+MAX_DIMENSIONS: Final = 8  #: maximum number of dimensions of an array, here and in results
 #: Name of the series that contains poses from motion capture, in world axes: arrays of x, y, z [m], the quaternion x,
 #: y, z, w and, if known, the velocity x, y, z [m/s].
 MOCAP: Final = "mocap"
@@ -81,7 +82,7 @@ class LogEntry(msgspec.Struct, frozen=True, array_like=True):
     text: Annotated[str, msgspec.Meta(max_length=MAX_LOG_TEXT)] | None = None
     number: Finite | None = None
     values: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: array, row by row
-    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: shape of the array
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=MAX_DIMENSIONS)] = ()  #: shape of the array
     severity: Severity = Severity.INFO  #: severity of a text
 
     def __post_init__(self) -> None:
@@ -135,7 +136,6 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
 # dataclass or `msgspec.Struct` is encoded as a map and decoded as a dict.
 
 ARRAY: Final = 1  #: extension type of arrays
-MAX_DIMENSIONS: Final = 8
 MAX_DEPTH: Final = 32  #: maximum nesting of lists and maps, which bounds the stack needed to traverse a value
 #: Allowed element types of arrays; these types are the same on every machine.
 DTYPES: Final = (
@@ -225,7 +225,7 @@ def _pack_array(array: NDArray[Any]) -> bytes:
     if array.nbytes > MAX_PAYLOAD or not shape_fits(array.shape, array.size, MAX_PAYLOAD):
         raise ValueError(
             f"it contains an array of {array.nbytes} bytes, of shape {array.shape}; results have at most "
-            f"{MAX_PAYLOAD} bytes and no longer axis"
+            f"{MAX_PAYLOAD} bytes and no axis longer than that"
         )
     plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
     return msgspec.msgpack.encode(_Array(array.dtype.name, array.shape, plain.tobytes()))

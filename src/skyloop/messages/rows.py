@@ -12,7 +12,7 @@ from skyloop.messages.feedback import Feedback
 _VELOCITY: Final = ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s")
 #: Names of the numbers in a drone's own state; axes and units are those of :class:`Feedback`.
 STATE: Final = ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m", *_VELOCITY)
-#: Names of the numbers in each of an application's set-points, by the name of the set-point.
+#: Names of the numbers in a set-point, by kind of set-point.
 ACTIONS: Final[dict[str, tuple[str, ...]]] = {
     "velocity": ("forward", "left", "up", "yaw_rate"),
     "attitude": ("roll", "pitch", "climb", "yaw_rate"),

@@ -17,14 +17,14 @@ from skyloop.messages.relayed import MAX_PARTS
 
 FEEDBACK: Final = "feedback"
 MIN_HZ: Final = 0.001  #: lowest rate: one sample every quarter of an hour, which keeps the period finite
-MAX_HZ: Final = 1000.0
+MAX_HZ: Final = 1000.0  #: highest rate that can be requested [samples/s]
 _FEEDBACK_RATE: Final = f"{FEEDBACK}?max_hz="
 TOLERANCE: Final = 0.1  #: fraction of a period by which a sample may arrive early
 
 VideoEncoding = Literal["raw", "jpeg", "h264"]
-DEFAULT_QUALITY: Final = 80
+DEFAULT_QUALITY: Final = 80  #: JPEG quality, 1 to 100
 MIN_KBIT_S: Final = 30  #: lowest bit rate of a stream that the proxy encodes
-MAX_KBIT_S: Final = 50_000
+MAX_KBIT_S: Final = 50_000  #: highest bit rate of a stream that the proxy encodes
 MAX_SUBSCRIBER: Final = 32  #: maximum length of a subscriber's name [characters]
 MIN_FPS: Final = 0.001  #: lowest rate: one frame every quarter of an hour, which keeps the period finite
 _ENCODINGS: Final = get_args(VideoEncoding)
@@ -68,10 +68,7 @@ class FeedbackRequest:
 
     @classmethod
     def parse(cls, topic: str) -> Self:
-        """Parse a topic in exactly the form of :attr:`topic`; raise :class:`UsageError` for any other form.
-
-        In this way, each request has only one topic and is encoded once.
-        """
+        """Parse a topic in exactly the form of :attr:`topic`; raise :class:`UsageError` for any other form."""
         if topic == FEEDBACK:
             return cls()
         try:
@@ -87,11 +84,11 @@ class FeedbackRequest:
     def union(self, other: FeedbackRequest) -> FeedbackRequest:
         """Return the smallest request that includes both requests."""
         if self.max_hz is None or other.max_hz is None:
-            return PLAIN
+            return EVERY_SAMPLE
         return self if self.max_hz >= other.max_hz else other
 
 
-PLAIN: Final = FeedbackRequest()
+EVERY_SAMPLE: Final = FeedbackRequest()
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,10 +199,7 @@ class VideoRequest:
 
 
 class FrameFilter:
-    """Selects a request's frames (``part``, ``max_fps``) from those of one camera, by number and capture time.
-
-    A filter has state, and each stream of frames needs its own.
-    """
+    """Selects a request's frames (``part``, ``max_fps``) from one stream of frames, by number and capture time."""
 
     def __init__(self, request: VideoRequest) -> None:
         self._part = request.part
@@ -222,13 +216,10 @@ class FrameFilter:
 
 
 class RateLimiter:
-    """Reduces a series of samples to an average rate.
-
-    A limiter has state, and each series and each consumer needs its own.
-    """
+    """Reduces one series of samples to an average rate for one consumer, beginning with the first sample."""
 
     def __init__(self, max_hz: float | None) -> None:
-        """Create a limiter. It keeps the first sample that arrives. None: keep all samples."""
+        """Create a limiter; if ``max_hz`` is None, keep all samples."""
         self.max_hz = math.inf if max_hz is None else max_hz
         self._due_ns: int | None = None
 
@@ -249,7 +240,7 @@ class RateLimiter:
         period_ns, due_ns = self._period_ns, self._due_ns
         if not period_ns:
             return True
-        # A time long before the previous one means that the source was restarted: start over.
+        # Start over after a pause of the source, or if its time jumped back because it was restarted.
         if due_ns is None or at_ns < due_ns - 2 * period_ns or at_ns >= due_ns + period_ns:
             self._due_ns = at_ns + period_ns
             return True

@@ -88,7 +88,7 @@ class ServerHandler(Protocol):
     def topic_problem(self, topic: str) -> str:
         """Return why a topic can't be subscribed to, and which topics exist; empty if it can.
 
-        May be called on any thread, even while another callback runs, and must return at once.
+        May be called on any thread, even while another callback runs; must return at once.
         """
 
     def malformed(self, peer: Peer, reason: str) -> None:
@@ -99,7 +99,7 @@ class ServerHandler(Protocol):
 
 
 class TransportServer(ABC):
-    """A proxy's end of a transport. Between :meth:`start` and :meth:`stop`, any thread may call all methods."""
+    """A proxy's end of a transport. Between :meth:`start` and :meth:`stop`, methods may be called from any thread."""
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
@@ -135,7 +135,7 @@ class TransportServer(ABC):
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (the default admits all)
         """Return why an application that has identified itself must leave; empty if it may stay (the default).
 
-        Some places may be reserved for pilots.
+        For example, the remaining places may be reserved for pilots.
         """
         return ""
 
@@ -145,7 +145,7 @@ class TransportServer(ABC):
 
     @property
     def counters(self) -> dict[str, float]:
-        """Return this end's counters since it was started, by dotted name, for the proxy's statistics. Any thread."""
+        """This end's counters since it was started, by dotted name, for the proxy's statistics."""
         return {}
 
     @property
@@ -160,7 +160,7 @@ class TransportServer(ABC):
 
 
 class ClientHandler(Protocol):
-    """A transport client's callbacks. The callbacks run on its receiving thread, one at a time."""
+    """A transport client's callbacks. They run on its receiving thread, one at a time."""
 
     def packet(self, packet: bytes) -> None:
         """Handle a packet from the proxy."""
@@ -174,7 +174,7 @@ class ClientHandler(Protocol):
         """
 
     def closed(self, reason: str) -> None:
-        """Handle the end of the connection, whichever end closed it. Called once, as the last callback."""
+        """Handle the end of the connection, regardless of which end closed it. Called once, as the last callback."""
 
 
 class TransportClient(ABC):

@@ -22,9 +22,8 @@ class CompositeServer(TransportServer):
             raise UsageError("a composite transport server needs at least one end")
         self._ends = tuple(ends)
         self.lock = PriorityLock()  #: a thread must hold this lock to call the handler
-        self._members: dict[
-            int, tuple[TransportServer, Peer]
-        ] = {}  # for each of our numbers, the end that the application is connected to, and its peer at that end
+        # By our number for an application: the end that it is connected to, and its peer at that end.
+        self._members: dict[int, tuple[TransportServer, Peer]] = {}
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
@@ -40,10 +39,7 @@ class CompositeServer(TransportServer):
             raise
 
     def stop(self) -> None:
-        """Stop all ends at the same time, and wait for them unless this is called from a handler.
-
-        Waiting inside a handler would deadlock, because its caller holds the lock that the stopping end waits for.
-        """
+        """Stop all ends at the same time, and wait for them unless this is called from a handler."""
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
             thread.start()

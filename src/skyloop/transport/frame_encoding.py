@@ -1,4 +1,4 @@
-"""Pure functions that encode frames as requested."""
+"""Encode and resize frames as requested. Pure."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import msgspec
 
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
+from skyloop.messages.fields import CHANNELS
 from skyloop.messages.subscription import VideoRequest
 from skyloop.transport.base import Pixels
-
-_CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 
 def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
@@ -20,7 +19,7 @@ def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> 
     A frame that is already a JPEG is returned unchanged, regardless of the request. Raises :class:`MissingExtraError`
     if OpenCV is needed but not installed, and :class:`LinkError` if OpenCV could not encode the frame.
     """
-    channels = _CHANNELS.get(header.encoding)
+    channels = CHANNELS.get(header.encoding)
     if channels is None or (request.encoding == "raw" and request.scale == 1.0):
         return header, pixels.tobytes()
     picture: Any = pixels.reshape(header.height, header.width, channels)
@@ -44,7 +43,7 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
 
 
 def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
-    """Return the header of a frame that is resized to these pixels, as plain pixels, with matching intrinsics."""
+    """Return the header of a frame resized to ``width`` × ``height`` plain pixels, with matching intrinsics."""
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:
@@ -52,12 +51,12 @@ def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
         lens = Intrinsics(
             lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
         )
-    size = width * height * _CHANNELS.get(header.encoding, 3)
+    size = width * height * CHANNELS.get(header.encoding, 3)
     return msgspec.structs.replace(header, width=width, height=height, size=size, intrinsics=lens)
 
 
 def resized(picture: Any, header: FrameHeader) -> Any:
-    """Resize an image of shape (height, width, channels) to the header's size. OpenCV averages areas."""
+    """Resize an image of shape (height, width, channels) to the header's size by averaging areas."""
     size = (header.width, header.height)
     return _opencv().resize(picture, size, interpolation=_opencv().INTER_AREA).reshape(header.height, header.width, -1)
 

@@ -147,9 +147,9 @@ class MemoryServer(TransportServer):
 
     def _receive(self, handler: ServerHandler, inbox: SimpleQueue[_Item | None]) -> None:
         while (item := inbox.get()) is not None:
-            client, tell = item
+            client, call = item
             try:
-                tell(handler)
+                call(handler)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
                 _log.exception("the server's handler failed; the connection to %s ends", client.peer.address)
                 self.end(client, f"the server's handler failed: {error!r}", muted=True)

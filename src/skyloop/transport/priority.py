@@ -35,7 +35,7 @@ def is_command(packet: bytes) -> bool:
 
 
 class Lane(IntEnum):
-    """The class of the first packet in a backlog, most urgent first."""
+    """The class of the leading packets in a backlog, most urgent first."""
 
     URGENT = 0  #: commands that include at least one that is not a set-point, such as a landing or an emergency stop
     STEERING = 1  #: set-points, or the keep-alives that are sent instead
@@ -64,7 +64,7 @@ class PacketBacklog:
 
     @property
     def lane(self) -> Lane | None:
-        """Lane of the leading commands, or OTHERS if the first packet is no command; None if the backlog is empty."""
+        """Lane of the leading commands, or OTHERS if the first packet isn't a command; None if the backlog is empty."""
         found = None
         for _, command in self._waiting.values():
             if command is None:
@@ -148,7 +148,7 @@ class PriorityLock:
         if self._taken.acquire(False):  # the most frequent case, handled in as few steps as possible
             self._owner = me
             return
-        if self._owner == me:
+        if self._owner == me:  # only this thread can have stored its identity, so no lock is needed to check
             self._depth += 1
             return
         woken = threading.Lock()
@@ -183,7 +183,6 @@ class PriorityLock:
 
     @property
     def waiting(self) -> int:
-        """Number of threads that wait."""
         return len(self._urgent) + len(self._others)
 
     __enter__ = acquire

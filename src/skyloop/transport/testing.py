@@ -17,7 +17,7 @@ import numpy as np
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.transport.base import Peer, Pixels, TransportClient
 
-PATIENCE_S: Final = 15.0
+PATIENCE_S: Final = 15.0  #: generous, because a busy machine must not fail the tests
 FRONT: Final = "front"
 
 
@@ -49,7 +49,7 @@ class ServerLog:
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
         self.refusals: list[tuple[Peer, str]] = []
-        self.problems: dict[str, str] = {}  #: the reasons why these topics can't be subscribed to
+        self.problems: dict[str, str] = {}  #: by topic, the reason why it can't be subscribed to
         self.complaints: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 

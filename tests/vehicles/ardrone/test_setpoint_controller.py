@@ -353,7 +353,7 @@ def test_a_stop_without_effect_is_abandoned_and_the_drone_can_land() -> None:
     cockpit = at(AIR)
     cockpit.take(Hover())
     cockpit.take(EmergencyStop())
-    with pytest.raises(DriverError, match="has not shown"):
+    with pytest.raises(DriverError, match="is not confirmed"):
         cockpit.take(ResetEmergency())
     for _ in range(340):
         cockpit.hears(AIR)

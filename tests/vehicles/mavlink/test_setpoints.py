@@ -945,7 +945,7 @@ def test_a_stop_right_after_arming_is_sent_at_once_and_survives_a_quick_reset(au
         bench.clock.advance(0.1)
         bench.hear(stale_heartbeat(bench))
         bench.tick()
-        with pytest.raises(DriverError, match="has not shown"):
+        with pytest.raises(DriverError, match="is not confirmed"):
             bench.apply(ResetEmergency())
     bench.go_on(1.0)
     assert bench.commands().count(CUT) in (10, 11, 12), "ten times a second until it shows"

@@ -42,7 +42,7 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
         except FileNotFoundError:
             raise UnknownNameError("proxy", name, [proxy.name for proxy in directory.proxies()]) from None
         except ConnectionRefusedError:
-            raise LinkError(f"the proxy {name!r} is not running: it was killed and left its socket {path}") from None
+            raise LinkError(f"the proxy {name!r} is not running: it was killed and left {path} behind") from None
         except BlockingIOError:
             raise LinkError(f"the proxy {name!r} does not accept connections: it is stopped or overloaded") from None
         except OSError as error:
@@ -53,7 +53,7 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """Return the names of the running proxies on this host that this user can reach; none on systems other than Linux.
+    """Return the running proxies on this host that this user can reach; none on systems other than Linux.
 
     Removes the sockets that killed proxies left behind. ``group``: as for :func:`dial`. Raises :class:`LinkError` if
     the directory of sockets is not safe.

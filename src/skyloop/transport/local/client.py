@@ -270,7 +270,6 @@ class LocalClient(TransportClient):
 
 
 def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    """Return the descriptors that came with a packet."""
     descriptors = array.array("i")
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
@@ -329,7 +328,7 @@ class Lease:
 class Leases:
     """The slots of one client. The garbage collector may call :meth:`released` on any thread at any point."""
 
-    #: Number of a camera's frames that an application may hold in place. Further frames are copied, so that an
+    #: Number of frames per camera that an application may hold in place. Further frames are copied, so that an
     #: application that collects frames does not use up all slots of the server and starve itself.
     IN_PLACE: Final = 3
 

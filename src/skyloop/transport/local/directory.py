@@ -33,8 +33,8 @@ from skyloop.transport.local.sockets import Socket, credentials, set_timeout, us
 DIRECTORY_VARIABLE: Final = "SKYLOOP_RUNTIME_DIR"
 GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
 MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
-LOCK_TIMEOUT_S: Final = 2.0
-CONNECT_TIMEOUT_S: Final = 1.0
+LOCK_TIMEOUT_S: Final = 2.0  #: how long to wait for another process that changes the directory
+CONNECT_TIMEOUT_S: Final = 1.0  #: time limit for a proxy to accept a connection
 PROXY: Final = "proxy"
 HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 _SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
@@ -121,7 +121,7 @@ class Directory:
         return found
 
     def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy. Skip this if the lock is held, because a reader never waits."""
+        """Remove the socket of a killed proxy unless the lock is held, because a reader never waits."""
         if self._lstat(self.path).st_uid != os.geteuid():
             return  # members of a group may read the directory, but can't remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
@@ -157,7 +157,7 @@ class Directory:
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
-        """Lock the directory against changes by other processes; :class:`LinkError` if one holds it for longer."""
+        """Lock the directory against changes by others; :class:`LinkError` if this takes longer than ``timeout_s``."""
         here, path = self._lstat(self.path), self.path
         flags = os.O_RDONLY | os.O_DIRECTORY
         if here.st_mode & stat.S_IRWXG:

@@ -39,7 +39,7 @@ class SlotMemory:
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
         """Reserve the memory [bytes]. Raises ``OSError`` if memory or descriptors run out."""
-        self.fd = -1
+        self.fd = -1  # for __del__, if reserving the memory fails
         self.number = number
         self.generation = generation
         self.capacity = capacity
@@ -224,7 +224,7 @@ class Camera:
 
 
 class FrameExchange:
-    """Manages all cameras of a server. Thread-safe. Frames are copied while the lock of the exchange is not held."""
+    """Manages all cameras of a server. Thread-safe. Frames are copied without holding the lock."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

@@ -29,7 +29,7 @@ from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Soc
 from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
 CHECK_S: Final = 0.5  #: interval between checks of silent connections, and of listeners that could not accept
-_AFTER_FAILURE_S: Final = 0.01
+_AFTER_FAILURE_S: Final = 0.01  # pause after a failed turn
 _PAUSE_S: Final = 100e-6  # if a wait took this long, no packet was pending
 _PACKETS_PER_POLL: Final = 8  # number of packets handled between checks for new ones
 _FIRST_COME: Final = tuple(Lane)
@@ -61,7 +61,7 @@ class Source:
 
 
 class _Thread(threading.Thread):
-    """The thread of a reactor."""
+    """A reactor's thread, recognised by its type when a handler stops its own server."""
 
 
 class Reactor:
@@ -278,7 +278,6 @@ class SharedLocalServer(LocalServer):
                     self._finish_connection(left, left.connection, "the proxy stopped")
 
     def _drop(self, source: Source) -> None:
-        """Remove a socket from all reactors."""
         source.ended = True
         self.reactor.remove(source)  # if a socket moves to another reactor, this one drops it as soon as it notices
 

@@ -35,13 +35,13 @@ from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.sockets import Credentials, ServerConnection, Socket, credentials, may_connect, user_name
 from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
 
-MAX_CLIENTS: Final = 128
+MAX_CLIENTS: Final = 128  #: maximum number of connections
 #: Connections allowed per process, so that no program takes them all. A cockpit page that flies has its own process.
 MAX_PER_PROCESS: Final = 64
 MAX_PER_USER: Final = 64  #: maximum per user who has access through a group; the proxy's own user may use all others
 PILOT_PLACES: Final = 32  #: connections reserved for pilots
 HELLO_S: Final = 2.0  #: time limit for the first packet, which a client sends when it connects
-_RETRY_ACCEPT_S: Final = 0.2
+_RETRY_ACCEPT_S: Final = 0.2  #: pause after a failure to accept a connection
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class LocalServer(TransportServer):
         self._exchange = FrameExchange()
         # These are replaced under the lock and never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
-        self._peers: dict[int, ServerConnection] = {}  # the peers, by number
+        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # a thread must hold this lock to call the handler
         self._receivers: set[int] = set()  # identities of the threads that receive
@@ -101,7 +101,7 @@ class LocalServer(TransportServer):
         self._finish(listener)
 
     def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
-        """Wait until all ends have stopped."""
+        """Wait until the accepting thread and all receiving threads have ended."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
             thread.join()  # a handler that stops its own server must not wait for itself
@@ -181,7 +181,7 @@ class LocalServer(TransportServer):
             accepted, _ = listener.accept()
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
-                # Out of descriptors or memory: without a pause, this thread would loop without rest.
+                # Out of descriptors or memory: without a pause, this thread would spin.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
