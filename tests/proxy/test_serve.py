@@ -148,7 +148,7 @@ def test_a_failing_process_lands_first_too(
         raise RuntimeError("no folder of keys any more")
 
     with pytest.raises(RuntimeError, match="no folder"):
-        serve("fake://", "toy", look=look)
+        serve("fake://", "toy", poll=look)
     told = capsys.readouterr().out.splitlines()
     assert [line for line in told if not line.startswith("ready")] == ["told takeoff", "told land", "closed"]
     apps[0].end.close()

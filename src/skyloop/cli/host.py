@@ -62,7 +62,7 @@ def proxy(
         name,
         make_end=net.server_ends(settings, group),
         parent_fd=parent_fd,
-        look=net.key_changes(settings),
+        poll=net.key_changes(settings),
         audit=audit,
         beside=net.metrics_beside(metrics),
     )

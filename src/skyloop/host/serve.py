@@ -99,7 +99,7 @@ class Answering:
         self._defaults = defaults
 
     def __call__(self, request: Request) -> Answer:
-        """Carry out a request. Runs on the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
+        """Carry out a request, on that request's own thread. Raises :class:`skyloop.errors.SkyloopError`."""
         host = self._host
         if isinstance(request, Remove):
             return Answer((host.remove(request.name, land=request.land),))

@@ -54,7 +54,7 @@ LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 # Return flight:
 NEAR_M: Final = 0.3  #: a vehicle that is this close and at rest has arrived
 CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arrived
-AT_REST_M_S: Final = 0.3
+AT_REST_M_S: Final = 0.3  #: maximum speed of a vehicle that counts as at rest
 HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this …
 STALL_NS: Final = 10 * NS_PER_S  #: … within this time
 #: If a return is not possible, how long a failsafe waits for that to change before it lands the vehicle in place.
@@ -123,7 +123,7 @@ class Autopilot:
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
         self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
-        #: Returns the permitted velocity for a desired one, given the newest feedback. Not called during a landing.
+        #: Returns the permitted velocity for a desired one, given fresh feedback. Not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()

@@ -36,8 +36,8 @@ BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
 AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this height [m]
 STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent without progress has reached the ground [m]
-STALL_NS: Final = NS_PER_S
-STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
+STALL_NS: Final = NS_PER_S  #: time without progress after which a descent has stalled
+STALL_HEADWAY: Final = 0.02  #: smallest decrease in altitude that counts as progress [m]
 BLIND_NS: Final = 15 * NS_PER_S  #: after this time, the result of a landing without sensor data is unknown
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -167,7 +167,7 @@ class Flight:
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Assume from now on that a vehicle found in the air may be on another flight; return whether it may be."""
+        """Assume from now on that the vehicle may be on someone else's flight; return whether others can fly it."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared

@@ -18,7 +18,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
 
-LEAST_KBIT_S: Final = 60
+LEAST_KBIT_S: Final = 60  #: the minimum rate
 #: The initial rate. Isolated late frames do not reduce the rate below it: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
@@ -34,7 +34,7 @@ SEARCH_1_S: Final = 2.0  #: growth per second below the initial rate, or while n
 MOST_WAIT_S: Final = 0.08  #: maximum delivery time of the frames in flight, beyond the shortest round trip
 SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled (the rate is not the cause)
 SILENT_FALL: Final = 0.5  #: factor for the rate after a stall, because the path's rate is then uncertain
-PROBE_S: Final = 0.15  #: interval between frames while frames wait
+PROBE_S: Final = 0.15  #: interval between frames while frames wait in the path
 PROBES_S: Final = 0.1  #: no frame is sent if more is in flight than the rate delivers in this time
 SELDOM: Final = 1 / 3  #: during silence, the interval is this fraction of the silence so far
 SELDOM_S: Final = 0.5  #: maximum interval between frames during silence
