@@ -73,8 +73,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the connection while the other has not, but not vice versa. Such a session
-            # finds no proxy or gets no answers, and Zenoh does not detect this. A new session has a new identity.
+            # One end may have forgotten the other, which still knows it. Such a session finds no proxy or gets no
+            # answers, and Zenoh does not detect this. A new session has a new identity.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -357,7 +357,7 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet until it is acknowledged; return False if there is no room. The caller holds the lock."""
+        """Send a packet, and again until it is acknowledged; False if there is no room. The caller holds the lock."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False

@@ -22,7 +22,7 @@ DEPTH: Final = 256  #: maximum number of unacknowledged packets to one end; furt
 MAX_BYTES: Final = 1 << 20  #: total size of unacknowledged packets to one end; further packets are refused [bytes]
 RECENT_PACKETS: Final = 64  #: number of recent packets that are remembered to detect repeats
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets
-#: Number of packets in flight. Zenoh queues as many per link before it drops one (``config._QUEUES``).
+#: Number of packets in flight. Zenoh queues this many per link before it drops one (``config._QUEUES``).
 ON_THE_WAY: Final = 16
 ON_THE_WAY_BYTES: Final = 1 << 18  #: total size of packets in flight [bytes]
 ACKNOWLEDGE_EVERY_S: Final = 0.15  #: acknowledgement interval if only the newest packet matters (:class:`Pace`)

@@ -262,7 +262,7 @@ class FabricServer(TransportServer):
         elif isinstance(message, packets.Subscribe):
             return self._publisher.subscribe(connection, message)
         elif isinstance(message, packets.Key):
-            return False  # only proxies send packets of these kinds
+            return False  # only proxies send packets of this kind
         else:
             self._registry.send_own(connection, packets.bye(message.reason))
             self._registry.end(connection, message.reason)

@@ -195,7 +195,7 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
     except x509.ExtensionNotFound:
         constraints = x509.BasicConstraints(ca=False, path_length=None)
     if not constraints.ca or not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
-        raise FileFormatError(f"{path} is not the certificate of an authority that skyloop keys init made")
+        raise FileFormatError(f"{path} is not the certificate of an authority created by Skyloop")
     if key is not None and not matches(key, certificate):
         raise UsageError(f"the key of the authority does not belong to its certificate {path}")
     return Authority(certificate, key)

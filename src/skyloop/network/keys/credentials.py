@@ -1,4 +1,4 @@
-"""Load and check an identity's folder for a program and watch it for a newer roster; encode and decode rosters.
+"""Load and check an identity's folder, read newer rosters from it, and encode and decode rosters.
 
 ================  ==============================================================================
 ``ca.pem``        the certificate of the lab's authority
@@ -34,7 +34,7 @@ from skyloop.network.keys import certificates
 from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 
-FORMAT: Final = 1
+FORMAT: Final = 1  #: version of the roster's format
 _PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
