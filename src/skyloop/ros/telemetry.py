@@ -28,7 +28,7 @@ from skyloop.vehicles.ros2.wire import (
 
 SLOW_NS: Final = 1_000_000_000  #: interval between battery messages, and between geographic positions
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
-JPEG_QUALITY: Final = 90
+JPEG_QUALITY: Final = 90  #: on OpenCV's scale, 0 to 100
 
 
 class Telemetry:
@@ -58,7 +58,7 @@ class Telemetry:
             self._open_transforms(drone.capabilities.cameras)
         except UnsupportedError as error:
             node.get_logger().warning(f"no /tf and no /tf_static: {error}")
-        self._told: dict[Any, str] = {}
+        self._last_text: dict[Any, str] = {}
         self._slow_ns = 0
         drone.on_feedback(self.publish)
 
@@ -122,11 +122,11 @@ class Telemetry:
             self._static.publish(encode_transforms(known))
 
     def _publish_text(self, publisher: Any, text: str) -> None:
-        """Publish a text if it differs from the last one."""
-        if self._told.get(publisher) != text:
+        """Publish text if it differs from the last one."""
+        if self._last_text.get(publisher) != text:
             from std_msgs.msg import String
 
-            self._told[publisher] = text
+            self._last_text[publisher] = text
             publisher.publish(String(data=text))
 
     # Messages ------------------------------------------------------------------------------------------------------
