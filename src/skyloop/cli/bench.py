@@ -21,7 +21,7 @@ class What(StrEnum):
     SIM = "sim"
 
 
-LEAST_S: Final = 0.5
+LEAST_S: Final = 0.5  #: minimum duration of a measurement
 _SMALL: Final = (320, 240)
 
 

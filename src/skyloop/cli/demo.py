@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from skyloop.control.follow import FollowMarker, FollowScore
 
 MARKER_ID = 7  #: marker on the board carried around the room
-ENOUGH_IN_VIEW = 0.9
-_REFRESH_HZ = 4
-_FIRST_PICTURE_S: Final = 10.0
+ENOUGH_IN_VIEW = 0.9  #: if the marker is in view in a smaller fraction of the frames, a headless run fails
+_REFRESH_HZ = 4  # of the status line
+_FIRST_PICTURE_S: Final = 10.0  # time limit for the first frame
 
 #: The option for a demonstration's port.
 PagePort = Annotated[

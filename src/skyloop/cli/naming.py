@@ -15,7 +15,7 @@ import typer
 
 from skyloop.errors import UsageError
 
-ANSWER_WITHIN_S: Final = 2.0
+ANSWER_WITHIN_S: Final = 2.0  #: time limit for a completion that asks a drone
 MULTICAST: Final = "multicast"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
@@ -45,7 +45,7 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def network_places(incomplete: str) -> list[str]:
     """Return ``multicast``, the only network place that is not an address."""
-    return [place for place in ("multicast",) if place.startswith(incomplete)]
+    return [MULTICAST] if MULTICAST.startswith(incomplete) else []
 
 
 def recordings(incomplete: str) -> list[str]:

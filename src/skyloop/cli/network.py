@@ -154,8 +154,8 @@ def settle(options: SimOptions) -> None:
 # A router -------------------------------------------------------------------------------------------------------
 
 
-ROUTER_PORT: Final = 7447
-_POLL_S: Final = 0.2
+ROUTER_PORT: Final = 7447  #: Zenoh's default port
+_POLL_S: Final = 0.2  # interval between checks for signals and newer keys
 
 
 def router(

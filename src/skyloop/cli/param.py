@@ -22,7 +22,7 @@ KINDS: Final = {
     ParameterType.INT: "a whole number",
     ParameterType.FLOAT: "a number",
     ParameterType.VECTOR: "numbers such as 0.1,0,-0.5",
-    ParameterType.TEXT: "a text",
+    ParameterType.TEXT: "text",
 }
 
 

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from skyloop.processing import Settings, Status
     from skyloop.vision.object_tracks import Detection, ObjectDetector
 
-LINE_EVERY_S: Final = 1.0
-_LOOK_S: Final = 0.1
-_MOST_WORKERS: Final = 64
+LINE_EVERY_S: Final = 1.0  #: interval between lines of progress
+_POLL_S: Final = 0.1  # interval at which a group of workers is checked
+_MOST_WORKERS: Final = 64  # chosen: more processes than the cores of usual computers
 MOST: Final = 64  #: only the most certain detections are published, because a result is limited to 32 768 bytes
 
 
@@ -133,7 +133,7 @@ def _lead(
     due = time.monotonic() + LINE_EVERY_S
     with Group(child_command(_arguments(settings, target, drone, seconds)), workers, tell) as group:
         while (ended := group.code) is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             status = group.status
             if time.monotonic() >= due and status is not None:
                 due = max(due + LINE_EVERY_S, time.monotonic())

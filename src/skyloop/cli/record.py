@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 0.25  # used on a terminal
 LINE_EVERY_S: Final = 1.0  # used if the output is a pipe
-_LOOK_S: Final = 0.5
+_POLL_S: Final = 0.5  # interval at which a viewer's subscriptions are checked
 
 
 def record(
@@ -221,7 +221,7 @@ def _watch(view: View, seconds: float) -> None:
     end = time.monotonic() + seconds
     before: dict[str, list[str]] = {}
     while (left := end - time.monotonic()) > 0:
-        time.sleep(min(_LOOK_S, left))
+        time.sleep(min(_POLL_S, left))
         if (now := view.subscribed) != before:
             before = now
             typer.echo("; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items()) or "nobody looks")
