@@ -55,10 +55,7 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
     for name in names:
         entry = COMMANDS[name]
         function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
-        shown: dict[str, Any] = {
-            "short_help": entry.summary,
-            "epilog": f"Example: skyloop {entry.example}",
-        }
+        shown: dict[str, Any] = {"short_help": entry.summary, "epilog": f"Example: skyloop {entry.example}"}
         if isinstance(function, typer.Typer):  # a command with subcommands
             for info in function.registered_commands:
                 info.cls = Command
@@ -256,7 +253,6 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write the arguments by name, and the options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

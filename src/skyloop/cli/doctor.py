@@ -77,7 +77,6 @@ MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow")
 
 
 def as_text(finding: Finding) -> Text:
-    """Return a finding as text for users."""
     mark, colour = MARKS[finding.health]
     text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
     return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text

@@ -30,8 +30,7 @@ _REPEAT_S: Final = 0.1  # interval at which it is repeated
 LEAVE: Final = "take over with --priority 0, or ask them"
 
 PriorityOption = Annotated[
-    int | None,
-    typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
+    int | None, typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]")
 ]
 AllOption = Annotated[bool, typer.Option("--all", help="All drones on this host, or on the --network")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array once all have ended")]

@@ -180,11 +180,7 @@ def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop lis
 
     far = "local" not in row.transport
     return connect(
-        row.name,
-        access="observe",
-        name=name,
-        timeout_s=ANSWER_WITHIN_S,
-        network=(settings or False) if far else False,
+        row.name, access="observe", name=name, timeout_s=ANSWER_WITHIN_S, network=(settings or False) if far else False
     )
 
 

@@ -49,12 +49,10 @@ def network_places(incomplete: str) -> list[str]:
 
 
 def recordings(incomplete: str) -> list[str]:
-    """Return recordings, and folders that may contain recordings."""
     return files_ending(incomplete, {".mcap"})
 
 
 def python_files(incomplete: str) -> list[str]:
-    """Return Python files, and folders that may contain them."""
     return files_ending(incomplete, {".py"})
 
 
@@ -102,8 +100,7 @@ NetworkOption = Annotated[
     ),
 ]
 KeysOption = Annotated[
-    Path | None,
-    typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]"),
+    Path | None, typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]")
 ]
 PriorityOption = Annotated[
     int, typer.Option("--priority", metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")

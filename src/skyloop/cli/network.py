@@ -53,8 +53,7 @@ ListenOption = Annotated[
 #: The former option for routers, used before ``--network`` accepted their addresses.
 ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
-    bool,
-    typer.Option("--multicast/--no-multicast", help="Network: be found by UDP multicast, if --network names it"),
+    bool, typer.Option("--multicast/--no-multicast", help="Network: be found by UDP multicast, if --network names it")
 ]
 KeysOption = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Network: folder of this proxy's identity [SKYLOOP_KEYS]")
@@ -69,11 +68,7 @@ MakeEnd = Callable[[str, str], "TransportServer"]
 
 
 def settings_of(
-    network: str | None,
-    listen: list[str] | None,
-    connect: list[str] | None,
-    multicast: bool,
-    keys: Path | None,
+    network: str | None, listen: list[str] | None, connect: list[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings | None:
     """Return the settings specified by the options, or None to stay on this host.
 
@@ -226,8 +221,7 @@ keys = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop keys "
 LabOption = Annotated[
-    Path | None,
-    typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys"),
+    Path | None, typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys")
 ]
 
 
@@ -278,8 +272,7 @@ def issue(
 
 @keys.command(short_help="Show who has keys, and until when", epilog=f"{_EXAMPLE}show")
 def show(
-    directory: LabOption = None,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
+    directory: LabOption = None, json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False
 ) -> None:
     """List all identities: role, drones, expiry. --dir may also be an identity's own folder, to show its copy.
 

@@ -110,12 +110,10 @@ def table(parameters: list[Parameter]) -> list[str]:
 
 
 def shorten(value: str) -> str:
-    """Return a value, shortened so that it fits into a table."""
     return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
 def details(parameter: Parameter) -> list[str]:
-    """Return all information about one parameter."""
     p = parameter
     rows = [
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),

@@ -118,12 +118,7 @@ def _lines(line: Callable[[], str], ended: threading.Event) -> None:
 
 
 def _lead(
-    workers: int,
-    settings: Settings,
-    target: str,
-    drone: str,
-    seconds: float | None,
-    show: Callable[[Status], str],
+    workers: int, settings: Settings, target: str, drone: str, seconds: float | None, show: Callable[[Status], str]
 ) -> None:
     """Run several workers, each in its own process, so that none has to wait for another worker's GIL."""
     from skyloop.processing.group import Group, child_command
@@ -158,12 +153,10 @@ def _arguments(settings: Settings, target: str, drone: str, seconds: float | Non
 
 
 def show_text(status: Status) -> str:
-    """Return a line for users."""
     return f"{time.strftime('%H:%M:%S')}  {status}"
 
 
 def show_json(status: Status) -> str:
-    """Return a line of output for programs."""
     return json_text(status)
 
 
@@ -235,7 +228,6 @@ class DetectionProcessor:
         self._classes = frozenset(classes)
 
     def process(self, frame: Frame) -> Output:
-        """Detect objects in one frame."""
         found = [one for one in self._detector.detect(frame) if not self._classes or one.class_name in self._classes]
         found = found[:MOST]
         return Output({"detections": [_value(one) for one in found]}, [s for one in found for s in _shapes(one)])

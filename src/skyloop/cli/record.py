@@ -139,8 +139,7 @@ def view(
     foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove, on this machine only")] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
-        str,
-        typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones"),
+        str, typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones")
     ] = "127.0.0.1",
     port: Annotated[
         int | None,

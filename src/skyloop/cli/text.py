@@ -161,7 +161,6 @@ _PLAIN_WORDS: Final = (
 
 
 def error_text(error: SkyloopError) -> str:
-    """Return an error's message for the command line."""
     hint = _HINTS.get(error.hint) if error.hint is not None else None
     return f"{error.reason}; {hint}" if hint else error.reason
 

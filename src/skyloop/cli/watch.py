@@ -128,7 +128,6 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """Return the complete display."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 

@@ -279,7 +279,6 @@ class Host:
             vehicle.report_stall(_STALL_S)
 
     def _on_hang(self, loop: SharedLoop, member: Any) -> None:
-        """Give up a vehicle whose driver hangs."""
         with self._lock:
             self._loops.remove(loop)
         loop.close()  # in case the thread ever returns

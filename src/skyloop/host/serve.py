@@ -161,7 +161,6 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
 
 
 def announce(line: str) -> None:
-    """Write a line to standard output."""
     with suppress(OSError):  # no one reads the output; continue serving
         print(line, flush=True)
 

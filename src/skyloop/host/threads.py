@@ -68,7 +68,6 @@ class Ticker:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no proxy to tick."""
         return not self._failures
 
     def split(self, stuck: Proxy) -> Ticker:
@@ -329,7 +328,6 @@ class LinkThread:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no link to serve."""
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:

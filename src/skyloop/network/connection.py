@@ -102,7 +102,6 @@ class ServerConnection:
             self._own.append(packet)
 
     def acknowledge(self, number: int) -> None:
-        """Acknowledge the application's packets up to this number."""
         with self.lock:
             self._taken = max(self._taken, number)
 

@@ -171,12 +171,10 @@ class Pace:
         self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
     def may_send(self, now_s: float) -> bool:
-        """Return whether another packet may be sent now."""
         stands = self._eager and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Record that a packet was sent."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 

@@ -187,7 +187,6 @@ class FramePublisher:
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:
-        """Stop sending a topic's frames to a connection."""
         with self._changed, contextlib.suppress(UsageError):
             camera = VideoRequest.parse(topic).camera
             self._drop(camera, topic, key)

@@ -89,7 +89,6 @@ class EventPublisher:
             self._send([EventDraft(kind, text, severity, app, data or {})])
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
-        """Publish these events, in this order."""
         with self._lock:
             self._send(drafts)
 
@@ -209,13 +208,11 @@ class Episodes:
 
 
 def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
-    """Return the event for a refused command from the application ``name``."""
     text = f"{name}: {command.action.name} refused: {why}"
     return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
 
 
 def clamped_event(name: str, clamp: Clamp) -> EventDraft:
-    """Return the event for a limit that reduced a set-point from the application ``name``."""
     zone = f" ({clamp.zone})" if clamp.zone else ""
     text = f"{name}: {clamp.limit}{zone} allows {clamp.applied:.3g} of {clamp.asked:.3g}"
     data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
@@ -262,13 +259,11 @@ def drift_event(drifts: bool) -> EventDraft:
 
 
 def emergency_event(name: str) -> EventDraft:
-    """Return the event for an emergency stop by the application ``name``."""
     text = f"emergency stop by {name}"
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """Return the event for the start or end of a failsafe step."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
@@ -282,7 +277,6 @@ def failsafe_event(change: StepChange) -> EventDraft:
 
 
 def battery_event(low: BatteryLow) -> EventDraft:
-    """Return the event for a battery below the warning level."""
     text = f"battery low: {low.battery:.0%} left"
     return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
 
@@ -314,7 +308,6 @@ class Named(Protocol):
 
 
 def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
-    """Return the name of the application with this number."""
     session = sessions.get(app_id)
     return session.name if session is not None else f"application {app_id}"
 

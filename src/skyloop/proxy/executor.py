@@ -76,7 +76,6 @@ class ActionExecutor:
         return self.autopilot is not None and self.autopilot.drifts
 
     def seen(self, now_ns: int) -> Snapshot:
-        """Return the vehicle's known state."""
         vehicle = self._publisher
         state = self.flight.state(vehicle.reported_state)
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)

@@ -194,7 +194,6 @@ class CommandHandler(FlightSupervisor):
             self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
     def holds(self, session: Session, lease: int) -> bool:
-        """Return whether the application holds the authority under this lease."""
         with self._lock:
             holder = self.authority.holder
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease

@@ -145,7 +145,6 @@ def audit_folder() -> Path:
 
 
 def audit_path(name: str) -> Path:
-    """Return the default path of a proxy's audit trail."""
     return audit_folder() / (name + SUFFIX)
 
 
@@ -166,7 +165,6 @@ class AuditTrail:
         self._thread.start()
 
     def begin(self, uri: str) -> None:
-        """Record the start of the proxy's run."""
         self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:

@@ -329,7 +329,6 @@ class FlightSupervisor:
         self._publisher.set_outcome(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
-        """Publish the echo of one of the proxy's own actions."""
         if self._subscribers(COMMANDS):
             echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
             self._publish(COMMANDS, encode(echo))

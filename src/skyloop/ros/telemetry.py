@@ -266,7 +266,6 @@ class CameraPublisher:
 
     @property
     def watched(self) -> bool:
-        """Whether any of the topics has a subscriber."""
         publishers = (self._image, self._info, self._compressed)
         return any(each is not None and each.get_subscription_count() for each in publishers)
 

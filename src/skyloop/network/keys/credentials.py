@@ -80,7 +80,6 @@ class Roster(msgspec.Struct, frozen=True):
     format: int = FORMAT
 
     def find(self, name: str) -> Entry | None:
-        """Return the entry for a name, or None if there is none."""
         return next((entry for entry in self.entries if entry.name == name), None)
 
     @property

@@ -106,7 +106,6 @@ class Lab:
         return decode_roster(read(path, "the roster"), self.authority, path)
 
     def folder(self, name: str) -> Path:
-        """Return the path of an identity's folder."""
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
