@@ -62,7 +62,8 @@ def demo(
 ) -> None:
     """Take off in a simulated room, find the marker, and follow it at 1.5 m with the camera. Ctrl-C lands."""
     console = Console(highlight=False, stderr=json)
-    report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
+    address = "sim://?" + urlencode({"world": world, "seed": seed})
+    report = _Demo(console, name, seconds).fly(address, not headless, port, browser)
     if json:
         print_json(report)
     else:
@@ -70,10 +71,6 @@ def demo(
     if headless and not report.good(ENOUGH_IN_VIEW):
         console.print(f"[bold red]{report.verdict(ENOUGH_IN_VIEW)}[/]")
         raise typer.Exit(1)
-
-
-def _address(world: str, seed: int) -> str:
-    return "sim://?" + urlencode({"world": world, "seed": seed})
 
 
 @dataclass(slots=True)

@@ -324,12 +324,9 @@ class Keyboard:
 
     def keys(self, within_s: float) -> list[str]:
         """Wait for keys and return those that were pressed. Raise ``EOFError`` if the terminal has been closed."""
-        if not self._ready(_ESC_ALONE_S if self._tokens.waits else within_s):
+        if not wait_readable(self._fd, _ESC_ALONE_S if self._tokens.waits else within_s):
             return self._tokens.flush()
         data = os.read(self._fd, 1024)
         if not data:
             raise EOFError
         return self._tokens.feed(data)
-
-    def _ready(self, within_s: float) -> bool:
-        return wait_readable(self._fd, within_s)

@@ -149,7 +149,6 @@ def settle(options: SimOptions) -> None:
 # A router -------------------------------------------------------------------------------------------------------
 
 
-ROUTER_PORT: Final = 7447  #: Zenoh's default port
 _POLL_S: Final = 0.2  # interval between checks for signals and newer keys
 
 
@@ -181,7 +180,7 @@ def router(
     from skyloop.network.config import Part
     from skyloop.network.session import Session, acquire, release, renewed
 
-    everywhere = f"{config.all_interfaces()}:{ROUTER_PORT}"
+    everywhere = f"{config.all_interfaces()}:{config.DEFAULT_PORT}"
     chosen = places(network, listen or [everywhere], connect, multicast, keys)
     if chosen.identity is not None:
         chosen.identity.require_router()

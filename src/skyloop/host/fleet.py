@@ -9,7 +9,7 @@ import msgspec
 
 from skyloop.drivers.registry import driver_class
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.errors import FileFormatError, ParameterError, SkyloopError, UsageError
+from skyloop.errors import FileFormatError, SkyloopError, UsageError
 from skyloop.files import decoded, expand
 from skyloop.messages import Value
 from skyloop.proxy.parameters import check_presets
@@ -210,5 +210,5 @@ def _checked(place: Place, key: str, check: Any) -> Any:
         return check()
     except FileFormatError:
         raise
-    except (UsageError, ParameterError, SkyloopError) as error:
+    except SkyloopError as error:
         raise place.error(key, error.reason) from None

@@ -135,7 +135,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when to acknowledge a topic's packets: within ``every_s`` [s] of their arrival. Not thread-safe."""
+    """Decides which of a topic's packets to acknowledge: one of many, or the next after ``every_s``. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0

@@ -149,7 +149,6 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:

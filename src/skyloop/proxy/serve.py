@@ -116,7 +116,10 @@ def serve(
     from skyloop.transport.local import LocalServer
 
     if parent_fd is not None:
-        _check_descriptor(parent_fd)
+        try:
+            os.fstat(parent_fd)
+        except OSError:
+            raise UsageError(f"file descriptor {parent_fd} is not open: give the reading end of a pipe") from None
     driver = make_driver(uri)
     end = LocalServer(name, group=group) if make_end is None else make_end(name, str(driver.uri))
     run(
@@ -182,7 +185,10 @@ def run(
                     proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
             if parent_fd is None:  # a parent process gets the proxy's events, and may not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
-                    _announce_link(proxy, link)
+                    vehicle = proxy.publisher
+                    state, reason, remedy = vehicle.link_state, vehicle.link_reason, vehicle.link_remedy
+                    if line := link.changed(state, reason, remedy, monotonic_ns()):
+                        announce(line)
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
@@ -267,26 +273,13 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _check_descriptor(descriptor: int) -> None:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        raise UsageError(f"file descriptor {descriptor} is not open: give the reading end of a pipe") from None
-
-
 def _announced(proxy: Proxy) -> LinkLines:
     where = f"{proxy.driver.uri} at {proxy.server.address}, process {os.getpid()}"
     lines = LinkLines(proxy.name, where, monotonic_ns())
-    _announce(lines.first(proxy.publisher.link_state))
+    announce(lines.first(proxy.publisher.link_state))
     return lines
 
 
-def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
-    vehicle = proxy.publisher
-    if line := lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns()):
-        _announce(line)
-
-
-def _announce(line: str) -> None:
+def announce(line: str) -> None:
     with suppress(OSError):  # no one reads standard output: continue serving
         print(line, flush=True)

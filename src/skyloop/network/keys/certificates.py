@@ -249,12 +249,6 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
         return x509.DNSName(name.lower())
 
 
-def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
-    public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
-    return public
-
-
 def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> Authority:
     key, name = new_key(), _name(title)
     builder = _builder(name, name, key, now, now + timedelta(days=days), authority=True)
@@ -274,10 +268,12 @@ def _issued(
 ) -> x509.Certificate:
     assert authority.key is not None
     issuer = authority.certificate
+    public = issuer.public_key()
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
     return (
         _builder(_name(title), issuer.subject, key, now, min(until, issuer.not_valid_after_utc), authority=False)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public), critical=False)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .sign(authority.key, hashes.SHA256())
     )

@@ -328,7 +328,7 @@ class Airspace:
             x, y, z = wall.normal
             most = self.allowed_speed(wall.distance, late_s)
             across = math.hypot(x, y)
-            if across > 0.3:
+            if across > 0.3:  # a wall that is nearly level limits only the climb rate, below
                 x, y = x / across, y / across
                 pull = x * east + y * north
                 outside = wall.distance < -MARGIN_M

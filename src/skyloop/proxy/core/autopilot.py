@@ -186,6 +186,7 @@ class Autopilot:
             self.mode = Mode.OFF
         elif known is not None and self.mode is not Mode.LAND:
             wanted = self.guard(wanted, known, now_ns)
+        # Limited, so that one step after a pause does not fill the integral.
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self._takes_velocity:

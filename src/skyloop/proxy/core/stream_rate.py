@@ -95,7 +95,7 @@ class StreamRate:
 
     def _holds(self, time_s: float) -> bool:
         """Return whether the rate delivers everything that is in flight within this time [s]."""
-        return self._bytes * 8e-3 <= self.kbit_s * time_s
+        return self._bytes * 8e-3 <= self.kbit_s * time_s  # 8e-3: from bytes to kbit
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Record that a frame was handed to the transport. ``seq`` is higher than for all earlier frames."""
@@ -122,7 +122,7 @@ class StreamRate:
         trip_ns = now_ns - newest.sent_ns
         self._add_trip(trip_ns, now_ns)
         wait_s = seconds(trip_ns - self._least_ns())
-        step_s = min(seconds(now_ns - self._changed_ns), 0.2)
+        step_s = min(seconds(now_ns - self._changed_ns), 0.2)  # after a pause, the rate must not jump
         self._changed_ns = now_ns
         waits = self._waits
         if wait_s > SILENT_S:
@@ -173,7 +173,7 @@ class StreamRate:
             self._shortest.popleft()
 
     def _least_ns(self) -> int:
-        return self._shortest[0][0] if self._shortest else nanoseconds(0.1)
+        return self._shortest[0][0] if self._shortest else nanoseconds(0.1)  # assumed until one is measured
 
 
 #: Factors for the frame's size, and fractions of the frames to send, best first. If the rate is too low for good frames
