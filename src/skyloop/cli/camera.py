@@ -166,7 +166,7 @@ class _Search:
                 if self.collector is None:
                     self.collector = Collector(*size)
                 elif self.collector.size != size:
-                    raise UsageError(f"{name} has {_by(size)} pixels, those before have {_by(self.collector.size)}")
+                    raise UsageError(f"{name} has {_by(size)} pixels, earlier ones have {_by(self.collector.size)}")
                 view = self._finder.find(picture, name)
                 if view is not None and found is not None:
                     found(picture, view)

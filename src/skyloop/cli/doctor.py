@@ -165,7 +165,7 @@ def _local_transport() -> Iterator[Finding]:
     try:
         directory.create()
     except OSError as error:
-        detail = f"{directory.path} can't be made: {error.strerror}"
+        detail = f"{directory.path} can't be created: {error.strerror}"
         yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory that you own")
     else:
         yield Finding("local transport", Health.GOOD, f"sockets in {directory.path}")

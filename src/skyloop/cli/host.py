@@ -169,7 +169,7 @@ def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
 
 
 def _restarts(row: VehicleStatus) -> str:
-    return f"started again {row.restarts} {'time' if row.restarts == 1 else 'times'}" if row.restarts else ""
+    return f"restarted {row.restarts} {'time' if row.restarts == 1 else 'times'}" if row.restarts else ""
 
 
 def _duration(seconds: float) -> str:

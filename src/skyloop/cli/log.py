@@ -246,7 +246,7 @@ def recover(
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
-    with progress_bar("looking") as progress:
+    with progress_bar("checking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
         tell(f"{file} is complete: there is nothing to repair")
@@ -254,7 +254,7 @@ def recover(
             print_json({"file": file, "saved": None})
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
-    with progress_bar("mending") as progress:
+    with progress_bar("repairing") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
         print_json({"file": file, "saved": saved})
@@ -455,7 +455,7 @@ def _comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
         )
     return [
         f"{new} against {old}",
-        table if found.fields else "no set-point is in both at one time",
+        table if found.fields else "no set-point occurs in both at the same time",
         f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
         f"the same kind of action {found.same_action:.1%} of the time; {parts}",
     ]

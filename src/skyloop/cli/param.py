@@ -119,7 +119,7 @@ def details(parameter: Parameter) -> list[str]:
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),
         ("  allowed", allowed(p) or KINDS[p.type]),
         ("  default", "" if p.default is None else show(p.default)),
-        ("  momentary", "writing it acts once" if p.momentary else ""),
+        ("  momentary", "each write acts once" if p.momentary else ""),
         ("  what", p.description),
     ]
     return columns([row for row in rows if row[1]])

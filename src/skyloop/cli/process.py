@@ -61,7 +61,7 @@ def process(
 ) -> None:
     """Process the newest frames of a drone with your own class, and publish the results. Read-only.
 
-    The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
+    The class has a method process(self, frame) that returns numbers, strings, lists, dicts, dataclasses or small NumPy
     arrays; read them with drone.results("NAME") and Controller.on_result. Progress is printed as one line per second.
     """
     from skyloop.processing import Settings, load_processor

@@ -223,4 +223,5 @@ def _watch(view: View, seconds: float) -> None:
         time.sleep(min(_POLL_S, left))
         if (now := view.subscribed) != before:
             before = now
-            typer.echo("; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items()) or "nobody looks")
+            words = "; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items())
+            typer.echo(words or "no subscribers")

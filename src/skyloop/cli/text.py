@@ -45,11 +45,8 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
-    return "".join(_PLAIN.get(one) or _unaccented(one) or "?" for one in lacking), error.end
-
-
-def _unaccented(character: str) -> str:
-    return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+    bare = (unicodedata.normalize("NFKD", one).encode("ascii", "ignore").decode() for one in lacking)
+    return "".join(_PLAIN.get(one) or letter or "?" for one, letter in zip(lacking, bare, strict=True)), error.end
 
 
 def tell(text: str) -> None:

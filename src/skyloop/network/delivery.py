@@ -135,7 +135,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides which of a topic's packets to acknowledge: one of many, or the next after ``every_s``. Not thread-safe."""
+    """Decides which of a topic's packets to acknowledge: one in many, or one every ``every_s``. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0

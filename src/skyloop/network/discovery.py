@@ -226,8 +226,8 @@ class ProxyWatch:
                 found = bool(self._runs)
             if not found and not complete:
                 raise NoAnswerError(
-                    f"the network was reached, but within {list_s:g} s not all nodes answered whether they know "
-                    f"the proxy {self._name!r}"
+                    f"the network was reached, but not all nodes listed their proxies within {list_s:g} s: the proxy "
+                    f"{self._name!r} may be among them"
                 )
             if not found:
                 others = {other for other, _ in known} - {self._name}

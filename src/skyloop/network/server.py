@@ -80,7 +80,7 @@ class FabricServer(TransportServer):
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
             if self._started:
-                raise UsageError(f"fabric:{self._name} was started before: make a new {type(self).__name__}")
+                raise UsageError(f"fabric:{self._name} was started before: create a new {type(self).__name__}")
             self._started = True
         self._check_free()
         session = self._session = acquire(self._settings, Part.PROXY)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from array import array
+from collections.abc import Callable
 from typing import Any, Final
 
 from skyloop.client import Drone, Frame
@@ -70,29 +71,17 @@ class Telemetry:
         if stamp_ns is None or feedback.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
             return
         rotation = _quaternion(feedback)
-        for publisher, make in (
-            (self._odometry, self._odometry_of),
-            (self._velocity, self._velocity_of),
-            (self._imu, self._imu_of),
-        ):
-            if publisher.get_subscription_count():
-                message = make(feedback, rotation, stamp_ns)
-                if message is not None:
-                    publisher.publish(message)
+        _publish(self._odometry, self._odometry_of, feedback, rotation, stamp_ns)
+        _publish(self._velocity, self._velocity_of, feedback, rotation, stamp_ns)
+        _publish(self._imu, self._imu_of, feedback, rotation, stamp_ns)
         if rotation is not None and feedback.position_m is not None and self._transforms is not None:
             frames = self._frames
             moved = Transform(stamp_ns, frames.odom, frames.base, feedback.position_m, rotation)
             self._transforms.publish(encode_transforms([moved]))
         if feedback.captured_ns - self._slow_ns >= SLOW_NS:
             self._slow_ns = feedback.captured_ns
-            self._publish_slow(feedback, stamp_ns)
-
-    def _publish_slow(self, feedback: Feedback, stamp_ns: int) -> None:
-        for publisher, make in ((self._battery, self._battery_of), (self._fix, self._fix_of)):
-            if publisher.get_subscription_count():
-                message = make(feedback, stamp_ns)
-                if message is not None:
-                    publisher.publish(message)
+            _publish(self._battery, self._battery_of, feedback, stamp_ns)
+            _publish(self._fix, self._fix_of, feedback, stamp_ns)
 
     def _open_transforms(self, cameras: tuple[CameraInfo, ...]) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -221,6 +210,12 @@ class Telemetry:
     def _head(self, message: Any, stamp_ns: int, frame: str) -> None:
         message.header.frame_id = frame
         message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(stamp_ns)
+
+
+def _publish(publisher: Any, make: Callable[..., Any], *given: Any) -> None:
+    """Make and publish a message if the topic has subscribers, unless the data is missing."""
+    if publisher.get_subscription_count() and (message := make(*given)) is not None:
+        publisher.publish(message)
 
 
 def _quaternion(feedback: Feedback) -> Quaternion | None:

@@ -184,7 +184,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
     except (ValueError, TypeError):  # an encrypted key raises TypeError
         raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
-        raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
+        raise FileFormatError(f"{path} is not a key made by skyloop keys: it must be on an elliptic curve")
     return key
 
 

@@ -258,7 +258,7 @@ def make_directory(path: Path) -> None:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = path.stat().st_mode
     except OSError as error:
-        raise UsageError(f"{path} can't be made: {error.strerror}") from None
+        raise UsageError(f"{path} can't be created: {error.strerror}") from None
     if mode & _OTHERS:
         raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
 

@@ -105,9 +105,9 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
             "the first one a letter or a digit"
         )
     if name == layout.ANYONE:
-        raise UsageError(f"no key can be named {layout.ANYONE!r}: that is the name of all who have no key")
+        raise UsageError(f"no key can be named {layout.ANYONE!r}: that name stands for everyone without a key")
     if role not in list(KeyRole):
-        raise UsageError(f"there is no role {role!r}; there are {', '.join(KeyRole)}")
+        raise UsageError(f"there is no role {role!r}: choose one of {', '.join(KeyRole)}")
     patterns = parse_drones(drones)
     if role == KeyRole.ROUTER and patterns != ALL_DRONES:
         raise UsageError("a router carries the traffic of all drones: leave out the drones")
