@@ -60,7 +60,7 @@ class VehiclePublisher:
 
     ``state_of`` returns the flight state, given the driver's state, because the software autopilot may know better.
     ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
-    in the vehicle's address from a text.
+    in the vehicle's address from text.
     """
 
     def __init__(

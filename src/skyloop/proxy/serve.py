@@ -101,7 +101,7 @@ def serve(
 ) -> None:
     """Serve a vehicle to this host's applications under a name. Blocks, and must be called on the main thread.
 
-    ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
+    ``make_end`` creates the transport server, given the name and the vehicle's address; by default, for this host only.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
     Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not

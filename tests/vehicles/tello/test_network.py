@@ -152,7 +152,7 @@ def test_parameters_reach_the_drone() -> None:
     ("name", "value", "said", "code"),
     [
         ("camera.fps", 20, "no camera.fps named '20'", Refusal.OUT_OF_RANGE),
-        ("camera.fps", "15", "takes an int", Refusal.WRONG_TYPE),
+        ("camera.fps", "15", "takes a int", Refusal.WRONG_TYPE),
         ("limits.speed", "fast", "takes a number", Refusal.WRONG_TYPE),
         ("limits.speed", 99.0, "from 0.05 to 10", Refusal.OUT_OF_RANGE),
         ("tello.flip", "over", "no tello.flip named 'over'", Refusal.OUT_OF_RANGE),
