@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LINE_EVERY_S: Final = 1.0  #: interval between lines of progress
 _POLL_S: Final = 0.1  # interval at which a group of workers is checked
-_MOST_WORKERS: Final = 64  # chosen: more processes than the cores of usual computers
+_MOST_WORKERS: Final = 64  # maximum of --workers
 MOST: Final = 64  #: only the most certain detections are published, because a result is limited to 32 768 bytes
 
 

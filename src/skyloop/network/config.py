@@ -34,7 +34,7 @@ OPEN_GIVEN_MS: Final = 1500
 #: waits only for the proxy at that address. With several, it must find all proxies with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
-#: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
+#: Maximum size of a message to a proxy [bytes]. Frames travel the other way. Larger ones are dropped before reassembly.
 MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")

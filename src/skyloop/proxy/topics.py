@@ -34,7 +34,7 @@ from skyloop.transport.base import (
 #: The topics whose names never change.
 FIXED_TOPICS: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
-PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
+PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topics of feedback variants
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 

@@ -400,7 +400,7 @@ class ReturnFlight:
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return None  # this refusal does not depend on the target
+            return None  # the airspace refuses this, whatever the target
         if self.phase is not ReturnPhase.NONE:
             problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
@@ -419,7 +419,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # Outside the box or inside a zone, the vehicle must not climb first, because the straight line leads back.
+        # Outside the box or inside a zone, the vehicle must not climb first: the straight line to the start leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:

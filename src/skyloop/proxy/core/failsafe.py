@@ -37,7 +37,7 @@ _LAND_AT_START: Final = ReturnToStart(land=True)
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
-    ReturnToStart: frozenset(),  # the whole return is steered
+    ReturnToStart: frozenset(),  # the proxy itself steers the return
 }
 
 
