@@ -419,7 +419,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # Outside the box or inside a zone, the vehicle must not climb first: the straight line to the start leads back.
+        # Outside the box or inside a zone, the vehicle must not climb first: the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:

@@ -84,7 +84,7 @@ class Flight:
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
         self.left_to = ""  #: what others made the vehicle do, as the driver reports it
-        self._believed_until_ns: int | None = None  # until then, a vehicle found in the air is taken for an earlier run's
+        self._believed_until_ns: int | None = None  # until then, a flight that is found counts as an earlier run's
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
         self._grounded_ns: int | None = None  # start of the current period of time on the ground
         self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
