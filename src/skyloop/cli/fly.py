@@ -352,7 +352,7 @@ SIMULATED: Final = "sim://?world=park&cameras=front&fps=15"
 SIDES: Final = {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
 _RESULT_WITHIN_S: Final = 3.0  # time limit for the first result of a processor
 _FIRST_FRAME_S: Final = 10.0  # time limit for the first frame
-_LINE_EVERY_S: Final = 1.0  # more often than for other flights, because the target may be lost within seconds
+_LINE_EVERY_S: Final = 1.0  # used if standard error is not a terminal
 
 
 def fly_follow(

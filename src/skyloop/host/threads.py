@@ -305,7 +305,7 @@ class LinkThread:
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards everything below but the order
+        self._lock = threading.Lock()  # guards what is known about the links
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
         self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with outdated times are stale

@@ -24,8 +24,8 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: maximum number of frames in flight to one reader
-#: Maximum number of formats in which one camera's frames are encoded. A format split into n parts counts as one whole
-#: format. The default formats are not counted, so there is always room for a pilot, whatever others request.
+#: Maximum number of formats in which one camera's frames are encoded. All parts of a split format count as one format.
+#: The default formats are not counted, so there is always room for a pilot, whatever others request.
 MAX_FORMS: Final = 32
 MAX_FORMS_EACH: Final = 8  #: maximum number of formats that one connection may read
 #: A frame not acknowledged after this time is considered lost: Zenoh drops what a congested link can't carry.

@@ -48,7 +48,7 @@ WAYS: Final = (ASK, ORDER, COMMAND)
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # signature and kind: garbage must not count as a report
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # signature, version and kind: garbage is no report
 _POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need poses to fly
 
 

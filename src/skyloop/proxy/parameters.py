@@ -50,8 +50,14 @@ PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one 
 #: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
-_TYPE_NAMES: Final = dict(zip(ParameterType, ("a bool", "an int", "a float", "text", "a vector"), strict=True))
-_KINDS: Final = dict(zip((bool, int, float, str, tuple), ParameterType, strict=True))
+_GIVEN_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "text", tuple: "a vector"}
+_TYPE_NAMES: Final = {
+    ParameterType.BOOL: "a bool",
+    ParameterType.INT: "an int",
+    ParameterType.FLOAT: "a float",
+    ParameterType.TEXT: "text",
+    ParameterType.VECTOR: "a vector",
+}
 _encoded = msgspec.msgpack.Encoder().encode
 
 
@@ -155,7 +161,7 @@ def check(parameter: Parameter, value: Value) -> Value:
             raise ParameterError(f"{parameter.name} takes {length} numbers, not {len(value)}", code=Refusal.WRONG_TYPE)
         value = tuple(_number(parameter, number) for number in value)
     elif not ((kind is ParameterType.BOOL and is_bool) or (kind is ParameterType.TEXT and isinstance(value, str))):
-        given = _TYPE_NAMES[_KINDS[type(value)]] if type(value) in _KINDS else type(value).__name__
+        given = _GIVEN_NAMES.get(type(value), type(value).__name__)
         unit = f" in {parameter.unit}" if parameter.unit else ""
         raise ParameterError(
             f"{parameter.name} takes {_TYPE_NAMES[kind]}{unit}, not {given} ({value!r:.60})", code=Refusal.WRONG_TYPE

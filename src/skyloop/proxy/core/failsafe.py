@@ -187,7 +187,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether the vehicle returns or lands because its battery is low. A pilot's decision can end this."""
+        """Whether the vehicle returns or lands because its battery is low. A pilot can end this, not by a set-point."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:
