@@ -55,10 +55,10 @@ class Group:
     """Several children running the same command. Leaving its ``with`` block ends them."""
 
     def __init__(
-        self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
+        self, command: Sequence[str], count: int, report: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
-        """Start ``count`` children; when one dies, ``tell`` is called with a message on its monitoring thread."""
-        self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
+        """Start ``count`` children; when one dies, ``report`` is called with a message on its monitoring thread."""
+        self._workers = [Worker(number, tuple(command), report, pause_s) for number in range(1, count + 1)]
 
     @property
     def status(self) -> Status | None:
