@@ -201,7 +201,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Wait for a landing by the pilot, such as another ``skyloop land``; return whether the drone is on the ground."""
+    """Wait while the pilot, such as another ``skyloop land``, is landing; return whether the drone is on the ground."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 

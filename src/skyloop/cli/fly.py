@@ -96,10 +96,7 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """Create the user's controller, and report methods that look like misspelt callbacks.
-
-    Raise ``UsageError`` if the class can't be created with a drone as its only argument.
-    """
+    """Create the user's controller, and report methods that look like misspelt callbacks."""
     from skyloop.control.controller import misspelt
 
     name = controller_class.__name__

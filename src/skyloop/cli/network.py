@@ -70,10 +70,7 @@ MakeEnd = Callable[[str, str], "TransportServer"]
 def settings_of(
     network: str | None, listen: list[str] | None, connect: list[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings | None:
-    """Return the settings specified by the options, or None to stay on this host.
-
-    Raise ``UsageError`` if an option requires ``--network``, or is invalid.
-    """
+    """Return the settings specified by the options, or None to stay on this host."""
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
         for option, value in given.items():
@@ -86,10 +83,7 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return a network's settings from the value of ``--network`` and the related options.
-
-    Raise ``UsageError`` if an address or the folder is invalid, or if no place is given.
-    """
+    """Return a network's settings from the value of ``--network`` and the related options."""
     from skyloop.network.config import serving
 
     return serving(network, listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
@@ -112,16 +106,13 @@ def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | No
 
 
 def metrics_beside(where: str | None) -> Beside | None:
-    """Return the metrics server to run alongside a process's proxies, or None without ``--metrics``.
-
-    Raise ``UsageError`` if ``where`` is not an address.
-    """
+    """Return the metrics server to run alongside a process's proxies, or None without ``--metrics``."""
     if where is None:
         return None
     from skyloop.metrics import serving_beside
     from skyloop.metrics.endpoint import parse_where
 
-    parse_where(where)
+    parse_where(where)  # reports an invalid address before anything starts
     return serving_beside(where, tell)  # on standard error, because programs read the proxies' lines on standard output
 
 

@@ -83,10 +83,7 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """Parse a value typed by a person, according to the parameter's type.
-
-    Raise ``UsageError`` if the value has the wrong type.
-    """
+    """Parse a value typed by a person, according to the parameter's type."""
     try:
         match parameter.type:
             case ParameterType.BOOL:

@@ -160,10 +160,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 
 
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
-    """Return the options of the world that the drones share.
-
-    Raise ``UsageError`` if an option is invalid, or if the drones can't share a world.
-    """
+    """Return the options of the world that the drones share."""
     from skyloop.vehicles.sim.options import options_of
 
     if len(uris) > drones:
@@ -198,7 +195,7 @@ def _serve_proxies(
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """Return the address of the vehicles. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
+    """Return the address of the vehicles. ``others``: options of the form KEY=VALUE."""
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
@@ -335,10 +332,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's.
-
-    Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
-    """
+    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's."""
     if drone == 0:
         return base
     try:
@@ -348,10 +342,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports.
-
-    Raise ``UsageError`` if a port is out of range.
-    """
+    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports."""
     from skyloop.vehicles.ardrone.emulator import Ports
 
     if base == 0:

@@ -28,15 +28,7 @@ from skyloop.host.threads import (
     Ticker,
     Watchdog,
 )
-from skyloop.host.vehicle import (
-    Condition,
-    HostedVehicle,
-    SharedVehicle,
-    VehicleStatus,
-    network_of,
-    proxy_status,
-    reason_of,
-)
+from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of, row_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import at_once
@@ -168,7 +160,7 @@ class Host:
             if self.vehicles.get(name) is vehicle:
                 del self.vehicles[name]
         self.announce(f"removed {name}")
-        return status if proxy is None else msgspec.structs.replace(status, **proxy_status(proxy))
+        return status if proxy is None else msgspec.structs.replace(status, **row_of(proxy))
 
     def _end(
         self,

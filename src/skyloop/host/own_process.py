@@ -21,7 +21,7 @@ from skyloop.child_process import ChildProcess, RestartingChild, handed_over
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import RefusedError, SkyloopError
 from skyloop.host.fleet import VehicleSettings, decoder_of_handed, encode_handed
-from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus, network_of, proxy_status, reason_of
+from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus, network_of, reason_of, row_of
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import run
 from skyloop.transport.base import TransportServer
@@ -194,7 +194,7 @@ def serve(settings: VehicleSettings) -> None:
         now_s = time.monotonic()
         if now_s - reported_s >= STATUS_EVERY_S:
             reported_s = now_s
-            _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **proxy_status(proxy)))
+            _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **row_of(proxy)))
         return () if keys is None else keys()
 
     run([proxy], parent_fd=0, poll=report, records=True)

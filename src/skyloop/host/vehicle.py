@@ -176,7 +176,7 @@ class SharedVehicle(HostedVehicle):
         proxy, row = self.proxy, self.row()
         if proxy is None or self.condition is not Condition.RUNNING:
             return row
-        return msgspec.structs.replace(row, **proxy_status(proxy))
+        return msgspec.structs.replace(row, **row_of(proxy))
 
     def report_stall(self, seconds: float) -> None:
         """Publish that the driver blocks, and that the vehicle no longer shares its threads."""
@@ -215,7 +215,7 @@ class SharedVehicle(HostedVehicle):
         return True
 
 
-def proxy_status(proxy: Proxy) -> dict[str, object]:
+def row_of(proxy: Proxy) -> dict[str, object]:
     """Return the part of a row that a running proxy provides."""
     vehicle = proxy.publisher
     feedback = vehicle.feedback_now
