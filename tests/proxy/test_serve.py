@@ -128,7 +128,7 @@ def test_in_this_process_it_releases_everything(tmp_path: Path, monkeypatch: pyt
     def end_it() -> None:
         os.kill(os.getpid(), signal.SIGTERM)  # its handler is in place, as applications could connect
 
-    monkeypatch.setattr("skyloop.proxy.serve._announce", lambda line: threading.Thread(target=end_it).start())
+    monkeypatch.setattr("skyloop.proxy.serve.announce", lambda line: threading.Thread(target=end_it).start())
     serve("fake://", "toy")
     assert signal.getsignal(signal.SIGTERM) is handler
     assert {thread for thread in threading.enumerate() if thread.name.startswith("skyloop")} <= before
