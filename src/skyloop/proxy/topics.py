@@ -62,8 +62,8 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
             return camera_problem(VideoRequest.parse(topic).camera, cameras)
         except UsageError as error:
             return str(error)
-    known = {*FIXED_TOPICS, *map(video, cameras()), *map(stream, cameras())}
-    return UnknownNameError("topic", topic[:64], known).message
+    available = {*FIXED_TOPICS, *map(video, cameras()), *map(stream, cameras())}
+    return UnknownNameError("topic", topic[:64], available).message
 
 
 def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
