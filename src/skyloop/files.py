@@ -1,4 +1,4 @@
-"""Access files: bounded reading and decoding with one kind of error, atomic replacement, and waiting for data."""
+"""Access files: bounded reading and decoding with one kind of error, and atomic replacement."""
 
 from __future__ import annotations
 
@@ -12,9 +12,6 @@ from typing import Final, TypeVar
 import msgspec
 
 from skyloop.errors import FileFormatError, UsageError
-
-if TYPE_CHECKING:
-    pass
 
 T = TypeVar("T")
 

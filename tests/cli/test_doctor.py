@@ -100,7 +100,7 @@ def test_an_impossible_directory_is_a_fault(run: Run, monkeypatch: pytest.Monkey
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/proc/none/run")
     ended = run("doctor")
     assert ended.code == 1
-    assert "✗ local transport: /proc/none/run can't be made" in ended.out
+    assert "✗ local transport: /proc/none/run can't be created" in ended.out
 
 
 def test_an_unsupported_system_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,7 @@ def test_a_missing_lab_is_reported_with_the_command_that_makes_one(
     ("options", "said"),
     [
         (["--keys", "KEYS/alpha"], "give --network multicast as well"),
-        (["--network", "--keys", "KEYS/jane"], "a proxy needs keys of --role proxy"),
+        (["--network", "--keys", "KEYS/jane"], "a proxy needs keys created with --role proxy"),
         (["--network", "--keys", "KEYS/bravo"], "not for the name 'alpha'"),
         (["--network", "--keys", "KEYS/nobody"], "there is no folder"),
         (["--network", "--keys", "KEYS/alpha", "--listen", "tcp/127.0.0.1:0"], "must begin with quic/ or tls/"),
@@ -136,7 +136,7 @@ def test_a_router_starts_with_a_routers_keys_only(run: Run, tmp_path: Path) -> N
         lab.issue(make_identity(name, role))
     ended = run("router", "--print-config", "--keys", str(lab.folder("jane")))
     assert (ended.code, ended.out) == (2, "")
-    assert "a router needs keys of --role router" in ended.err
+    assert "a router needs keys created with --role router" in ended.err
     printed = json.loads(run("router", "--print-config", "--keys", str(lab.folder("hub"))).out)
     assert [subject["id"] for subject in printed["access_control"]["subjects"]] == ["hub", "jane"]
     assert printed["transport"]["link"]["tls"]["enable_mtls"] is True

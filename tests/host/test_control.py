@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -19,12 +20,12 @@ from skyloop.host.serve import (
     Add,
     AddNamed,
     Answer,
-    Answering,
     ControlServer,
     Remove,
     Status,
     ask,
     chosen_host,
+    respond,
     running_hosts,
 )
 from skyloop.transport.local.directory import HOST, connect, find_directory
@@ -35,7 +36,7 @@ from tests.host.fleet import Hosting
 def served(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosting]:
     """A host whose control socket is named ``host``."""
     monkeypatch.setattr("skyloop.host.fleet.driver_class", lambda scheme: scheme)  # fake:// has no driver
-    server = ControlServer("host", Answering(hosting.host, Defaults(limits=FlightLimits(speed=0.5))))
+    server = ControlServer("host", partial(respond, hosting.host, Defaults(limits=FlightLimits(speed=0.5))))
     server.start()
     yield hosting
     server.stop()

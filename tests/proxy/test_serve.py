@@ -128,7 +128,7 @@ def test_in_this_process_it_releases_everything(tmp_path: Path, monkeypatch: pyt
     def end_it() -> None:
         os.kill(os.getpid(), signal.SIGTERM)  # its handler is in place, as applications could connect
 
-    monkeypatch.setattr("skyloop.proxy.serve._announce", lambda line: threading.Thread(target=end_it).start())
+    monkeypatch.setattr("skyloop.proxy.serve.announce", lambda line: threading.Thread(target=end_it).start())
     serve("fake://", "toy")
     assert signal.getsignal(signal.SIGTERM) is handler
     assert {thread for thread in threading.enumerate() if thread.name.startswith("skyloop")} <= before
@@ -148,7 +148,7 @@ def test_a_failing_process_lands_first_too(
         raise RuntimeError("no folder of keys any more")
 
     with pytest.raises(RuntimeError, match="no folder"):
-        serve("fake://", "toy", look=look)
+        serve("fake://", "toy", poll=look)
     told = capsys.readouterr().out.splitlines()
     assert [line for line in told if not line.startswith("ready")] == ["told takeoff", "told land", "closed"]
     apps[0].end.close()

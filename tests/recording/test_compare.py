@@ -109,7 +109,7 @@ def test_recordings_with_nothing_in_common_are_reported_in_unbroken_lines(
     log: Log, flight: Path, tmp_path: Path
 ) -> None:
     ended = log("compare", flight, write_flight(tmp_path / "places.mcap", Plan(places=True)))
-    assert "no set-point is in both at one time" in ended.out
+    assert "no set-point occurs in both at the same time" in ended.out
     assert any("s compared, " in line and "they diverge at" in line for line in ended.out.splitlines())
 
 

@@ -22,12 +22,12 @@ from skyloop.errors import MissingExtraError, ParameterError, SkyloopError, inst
 
 _log = logging.getLogger(__name__)
 VERBOSE: Final = "--verbose"  #: accepted before and after any command
-FAILED: Final = 1
-USAGE_ERROR: Final = 2
-_WIDEST: Final = 80
-_NARROWEST: Final = 34
-_COLUMN: Final = 30  #: width of the options column; the text of longer options starts on the next line
-_NARROW_COLUMN: Final = 8
+FAILED: Final = 1  #: exit code
+USAGE_ERROR: Final = 2  #: exit code
+_WIDEST: Final = 80  # help uses no more columns of a terminal than this
+_NARROWEST: Final = 34  # minimum width of help texts
+_COLUMN: Final = 30  # width of the options column; the text of longer options starts on the next line
+_NARROW_COLUMN: Final = 8  # the same in narrow terminals
 _KINDS: Final = (
     (re.compile(r"<(?:float|int)(?: range)?>"), "N"),
     (re.compile(r"<str>"), "TEXT"),
@@ -55,10 +55,7 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
     for name in names:
         entry = COMMANDS[name]
         function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
-        shown: dict[str, Any] = {
-            "short_help": entry.summary,
-            "epilog": f"Example: skyloop {entry.example}",
-        }
+        shown: dict[str, Any] = {"short_help": entry.summary, "epilog": f"Example: skyloop {entry.example}"}
         if isinstance(function, typer.Typer):  # a command with subcommands
             for info in function.registered_commands:
                 info.cls = Command
@@ -128,12 +125,12 @@ def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
 
 def _fail(error: SkyloopError, arguments: list[str], name: str) -> NoReturn:
     _log.debug("the command failed", exc_info=error)
-    told, entry = error_text(error), entry_of(arguments)
-    if entry is not None and install_command("") in told:  # the command's own error, or that of a proxy it started
+    text, entry = error_text(error), entry_of(arguments)
+    if entry is not None and install_command("") in text:  # the command's own error, or that of a proxy it started
         from skyloop.cli.install import with_all_missing
 
-        told = with_all_missing(told, entry.extras)
-    print(coloured(f"{name}: {told}", sys.stderr), file=sys.stderr)
+        text = with_all_missing(text, entry.extras)
+    print(coloured(f"{name}: {text}", sys.stderr), file=sys.stderr)
     sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
 
 
@@ -168,7 +165,7 @@ def _skyloop(
 
 
 def width() -> int:
-    """Return the width of help texts in columns: the terminal's width, but at most 80."""
+    """Return the width of help texts in columns: 2 less than the terminal's width, from 34 to 78."""
     return max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns) - 2)
 
 
@@ -179,11 +176,9 @@ class Command(TyperCommand):
     """
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line."""
         return [self.options_metavar or "", *argument_words(self, ctx)]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the arguments and options."""
         write_options(self, ctx, formatter)
 
 
@@ -191,16 +186,13 @@ class Group(TyperGroup):
     """A command with subcommands; they are listed with their full summaries, wrapped if necessary."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return the parts of the usage line."""
         return [self.options_metavar or "", *argument_words(self, ctx), self.subcommand_metavar]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
-        """Write the options, and the list of commands."""
         write_options(self, ctx, formatter)
         self.format_commands(ctx, formatter)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands."""
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         summaries = [(name, each.short_help or each.get_short_help_str(200)) for name, each in commands.items() if each]
         write_sections(formatter, {"Commands": summaries})
@@ -210,7 +202,6 @@ class ByTask(Group):
     """All commands in the order of the table, each created on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  Typer's signature
-        """Return the names of the commands in the order used in help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -262,7 +253,6 @@ def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
 
 
 def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write the arguments by name, and the options with their values."""
     for title, rows in described(command, ctx).items():
         with formatter.section(title):
             formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)

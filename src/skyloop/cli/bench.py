@@ -21,7 +21,7 @@ class What(StrEnum):
     SIM = "sim"
 
 
-LEAST_S: Final = 0.5
+LEAST_S: Final = 0.5  #: minimum duration of a measurement
 _SMALL: Final = (320, 240)
 
 
@@ -61,7 +61,7 @@ def bench(
 
 
 def parse_sizes(text: str | None, largest: tuple[int, int] = (1920, 1080)) -> list[tuple[int, int]]:
-    """Parse frame sizes such as ``320x240,640x480``. Raise ``UsageError`` if the text is not a list of sizes."""
+    """Parse frame sizes such as ``320x240,640x480``."""
     sizes = []
     for word in text.split(",") if text is not None else ["x".join(map(str, _SMALL))]:
         width, _, height = word.strip().replace("×", "x").partition("x")

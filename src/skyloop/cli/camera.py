@@ -30,8 +30,8 @@ camera = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 _EXAMPLE: Final = "Example: skyloop camera "
 _MAX_BYTES: Final = 256 << 20  #: maximum size of an image file
 _PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
-_GOOD_COVERAGE: Final = 0.5
-_GOOD_RMS_PX: Final = 1.0
+_GOOD_COVERAGE: Final = 0.5  # warn if a smaller fraction of the image was covered by views of the board
+_GOOD_RMS_PX: Final = 1.0  # warn if the reprojection error is larger
 _PATIENCE_S: Final = 10.0  # maximum time spent waiting for a frame
 
 
@@ -166,7 +166,7 @@ class _Search:
                 if self.collector is None:
                     self.collector = Collector(*size)
                 elif self.collector.size != size:
-                    raise UsageError(f"{name} has {_by(size)} pixels, those before have {_by(self.collector.size)}")
+                    raise UsageError(f"{name} has {_by(size)} pixels, earlier ones have {_by(self.collector.size)}")
                 view = self._finder.find(picture, name)
                 if view is not None and found is not None:
                     found(picture, view)

@@ -29,8 +29,7 @@ def cockpit(
         ),
     ] = None,
     host: Annotated[
-        str,
-        typer.Option(metavar="ADDRESS", help="Address; beyond loopback this needs --pair, tokens or certificates"),
+        str, typer.Option(metavar="ADDRESS", help="Address; beyond loopback this needs --pair, tokens or certificates")
     ] = "127.0.0.1",
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="File of people to admit: lines of ROLE TOKEN [NAME]")

@@ -87,11 +87,7 @@ COMMANDS: Final = {
     "list": Entry(Task.SEE, "listing:list_proxies", "List running proxies and their pilots", "list"),
     "watch": Entry(Task.SEE, "watch:watch", "Watch a drone live in the terminal", "watch alpha"),
     "cockpit": Entry(
-        Task.SEE,
-        "cockpit:cockpit",
-        "Serve a web page to watch and fly drones",
-        "cockpit --port 8000",
-        ("cockpit",),
+        Task.SEE, "cockpit:cockpit", "Serve a web page to watch and fly drones", "cockpit --port 8000", ("cockpit",)
     ),
     "view": Entry(Task.SEE, "record:view", "Show drones live in Foxglove or Rerun", "view alpha --foxglove"),
     "process": Entry(
@@ -139,10 +135,7 @@ COMMANDS: Final = {
         Task.RECORD, "log:log", "Inspect, export, compare and repair recordings", "log info flight.mcap", ("record",)
     ),
     "doctor": Entry(
-        Task.SET_UP,
-        "doctor:doctor",
-        "Check this machine, or one vehicle",
-        "doctor mavlink://tcp:127.0.0.1:5760",
+        Task.SET_UP, "doctor:doctor", "Check this machine, or one vehicle", "doctor mavlink://tcp:127.0.0.1:5760"
     ),
     "install": Entry(Task.SET_UP, "install:install", "Install optional parts of Skyloop", "install sim vision cockpit"),
     "param": Entry(

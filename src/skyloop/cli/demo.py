@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from skyloop.control.follow import FollowMarker, FollowScore
 
 MARKER_ID = 7  #: marker on the board carried around the room
-ENOUGH_IN_VIEW = 0.9
-_REFRESH_HZ = 4
-_FIRST_PICTURE_S: Final = 10.0
+ENOUGH_IN_VIEW = 0.9  #: if the marker is in view in a smaller fraction of the frames, a headless run fails
+_REFRESH_HZ = 4  # of the status line
+_FIRST_PICTURE_S: Final = 10.0  # time limit for the first frame
 
 #: The option for a demonstration's port.
 PagePort = Annotated[
@@ -62,7 +62,8 @@ def demo(
 ) -> None:
     """Take off in a simulated room, find the marker, and follow it at 1.5 m with the camera. Ctrl-C lands."""
     console = Console(highlight=False, stderr=json)
-    report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
+    address = "sim://?" + urlencode({"world": world, "seed": seed})
+    report = _Demo(console, name, seconds).fly(address, not headless, port, browser)
     if json:
         print_json(report)
     else:
@@ -70,10 +71,6 @@ def demo(
     if headless and not report.good(ENOUGH_IN_VIEW):
         console.print(f"[bold red]{report.verdict(ENOUGH_IN_VIEW)}[/]")
         raise typer.Exit(1)
-
-
-def _address(world: str, seed: int) -> str:
-    return "sim://?" + urlencode({"world": world, "seed": seed})
 
 
 @dataclass(slots=True)

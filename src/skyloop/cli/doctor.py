@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.messages.parameter import Diagnostic
 
-IMPORT_BUDGET_S: Final = 0.3
+IMPORT_BUDGET_S: Final = 0.3  #: an import that takes longer is reported as slow
 
 #: Ports that Skyloop listens on or that vehicles send to, and their purposes.
 PORTS: Final = (
@@ -49,11 +49,11 @@ PORTS: Final = (
 )
 ANSWER_S: Final = 3.5  #: time allowed for a vehicle to answer; chosen so that the user gets a result within 5 s
 PATIENCE_S: Final = 40.0  #: time limit for reading the settings of a vehicle that responds
-FEEDBACK_S: Final = 3.0
+FEEDBACK_S: Final = 3.0  #: time limit for the battery's charge
 SETTLE_S: Final = 2.0  #: time to wait for faults to clear that our first messages fix, such as a missing stick input
-LOOK_S: Final = 0.1
+_POLL_S: Final = 0.1  # interval between checks during that time
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
-STATE_S = 2.0
+STATE_S = 2.0  #: time limit for the first feedback
 VIDEO_S = 5.0  #: time limit for the first image; a Tello that has just been switched on takes several seconds
 
 
@@ -77,7 +77,6 @@ MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow")
 
 
 def as_text(finding: Finding) -> Text:
-    """Return a finding as text for users."""
     mark, colour = MARKS[finding.health]
     text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
     return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text
@@ -166,7 +165,7 @@ def _local_transport() -> Iterator[Finding]:
     try:
         directory.create()
     except OSError as error:
-        detail = f"{directory.path} can't be made: {error.strerror}"
+        detail = f"{directory.path} can't be created: {error.strerror}"
         yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory that you own")
     else:
         yield Finding("local transport", Health.GOOD, f"sockets in {directory.path}")
@@ -299,7 +298,7 @@ def _proxies() -> Iterator[Finding]:
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """Return the findings about a vehicle in reading order. Raise ``SkyloopError`` if the address is invalid."""
+    """Yield the findings about a vehicle in reading order. Raise ``SkyloopError`` if the address is invalid."""
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.drivers.registry import make_driver
 
@@ -336,7 +335,7 @@ def _settled(driver: Driver) -> list[Diagnostic]:
         found = driver.checkup()
         if time.monotonic() >= end or all(each.good or not each.severe for each in found):
             return found
-        time.sleep(LOOK_S)
+        time.sleep(_POLL_S)
 
 
 def _unreachable(sink: RecordingSink) -> Finding:

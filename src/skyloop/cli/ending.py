@@ -26,12 +26,11 @@ FRESH_S: Final = 1.0  #: maximum age at which a state can still be trusted
 LANDING_S: Final = 60.0  #: maximum time to wait for a landing
 RETURN_S: Final = 600.0  #: maximum time to wait for a return
 STOPPING_S: Final = 3.0  #: time for which a stop is repeated until the vehicle reports it
-_REPEAT_S: Final = 0.1
+_REPEAT_S: Final = 0.1  # interval at which it is repeated
 LEAVE: Final = "take over with --priority 0, or ask them"
 
 PriorityOption = Annotated[
-    int | None,
-    typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
+    int | None, typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]")
 ]
 AllOption = Annotated[bool, typer.Option("--all", help="All drones on this host, or on the --network")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON array once all have ended")]
@@ -154,7 +153,7 @@ def _each(
     json: bool,
     interrupted: Callable[[], None] = lambda: None,
 ) -> None:
-    """End all flights in parallel. Print a line for each drone as soon as it is done, or everything as JSON.
+    """End all flights in parallel. Print a line for each drone, in the given order, as they end, or all as JSON.
 
     ``interrupted`` is called when Ctrl-C is pressed and must make each call of ``end`` return or raise.
     """
@@ -202,7 +201,7 @@ def _land(name: str, priority: int) -> str:
 
 
 def _lands_for_others(name: str) -> bool:
-    """Return whether its pilot, such as another ``skyloop land``, is landing it; if so, wait until it has landed."""
+    """Wait while the pilot, such as another ``skyloop land``, is landing; return whether the drone is on the ground."""
     from skyloop.client import connect
     from skyloop.messages import FlightState
 

@@ -37,8 +37,8 @@ ADVICE = (
     "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 )
 Make = Callable[[type["Controller"]], "Controller"]
-_LOOK_S: Final = 0.1  #: interval between checks that the drone is still connected, while waiting for a corrected file
-REFRESH_HZ: Final = 4
+_POLL_S: Final = 0.1  # interval between checks that the drone is still connected, while waiting for a corrected file
+REFRESH_HZ: Final = 4  #: of the line on a terminal
 LINE_EVERY_S: Final = 5.0  #: used if standard error is not a terminal
 
 
@@ -96,10 +96,7 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """Create the user's controller, and report methods that look like misspelt callbacks.
-
-    Raise ``UsageError`` if the class can't be created with a drone as its only argument.
-    """
+    """Create the user's controller, and report methods that look like misspelt callbacks."""
     from skyloop.control.controller import misspelt
 
     name = controller_class.__name__
@@ -126,18 +123,9 @@ def run(
     takeoff: bool,
     progress: FlightProgress | None = None,
 ) -> bool:
-    """Take off if requested, and fly.
+    """Take off if requested, and fly for ``seconds``, or until the controller ends or Ctrl-C is pressed.
 
-    Args:
-        flight: The flight to run.
-        drone: The drone, connected as a pilot.
-        seconds: The duration; if None, run until the controller ends or Ctrl-C is pressed.
-        reloader: Reloads the controller's file; if None, it is never reloaded.
-        takeoff: Whether to take off from the ground.
-        progress: A function that shows the progress, or None for the default progress display of flights.
-
-    Returns:
-        Whether the flight ended as intended. Errors during take-off are raised; errors in the controller are shown.
+    Return whether the flight ended as intended. Errors during take-off are raised; errors in the controller are shown.
     """
     progress = progress or FlightProgress(drone)
     try:
@@ -222,11 +210,11 @@ class Flight:
         while not (reloader.waiting and self._take(reloader, make)):
             if self._drone.closed or time.monotonic() >= deadline:
                 return False
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         return True
 
     def _take(self, reloader: Reloader, make: Make) -> bool:
-        """Replace the current controller with the loaded one, if possible. The old one can then no longer fly it."""
+        """Replace the current controller with the loaded one, if possible, and stop the old one's callbacks."""
         found, known = reloader.take(), Known(self._drone)
         older = known.listeners
         try:
@@ -278,11 +266,9 @@ def _own_line(stack: Iterable[traceback.FrameSummary], home: str) -> traceback.F
 class FlightProgress:
     """Shows a flight's progress on standard error within a ``with`` block.
 
-    Args:
-        drone: The drone.
-        live: Whether to update one line in place; if None, do so only if standard error is a terminal.
-        what: Returns the state of the flight, shown at the beginning of the line.
-        every_s: Interval between lines if standard error is not a terminal; if None, :data:`LINE_EVERY_S`.
+    ``live``: whether to update one line in place; if None, only if standard error is a terminal. ``what`` returns text
+    for the beginning of the line. ``every_s``: interval between lines if not ``live``, by default
+    :data:`LINE_EVERY_S`.
     """
 
     def __init__(
@@ -361,9 +347,9 @@ def flight_line(drone: Drone, flown_s: float) -> str:
 SIMULATED: Final = "sim://?world=park&cameras=front&fps=15"
 #: Directions as seen from the target, counter-clockwise from its direction of motion.
 SIDES: Final = {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2}
-_RESULT_WITHIN_S: Final = 3.0
-_FIRST_FRAME_S: Final = 10.0
-_LINE_EVERY_S: Final = 1.0
+_RESULT_WITHIN_S: Final = 3.0  # time limit for the first result of a processor
+_FIRST_FRAME_S: Final = 10.0  # time limit for the first frame
+_LINE_EVERY_S: Final = 1.0  # used if standard error is not a terminal
 
 
 def fly_follow(

@@ -62,7 +62,7 @@ def proxy(
         name,
         make_end=net.server_ends(settings, group),
         parent_fd=parent_fd,
-        look=net.key_changes(settings),
+        poll=net.key_changes(settings),
         audit=audit,
         beside=net.metrics_beside(metrics),
     )
@@ -169,7 +169,7 @@ def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
 
 
 def _restarts(row: VehicleStatus) -> str:
-    return f"started again {row.restarts} {'time' if row.restarts == 1 else 'times'}" if row.restarts else ""
+    return f"restarted {row.restarts} {'time' if row.restarts == 1 else 'times'}" if row.restarts else ""
 
 
 def _duration(seconds: float) -> str:

@@ -117,7 +117,7 @@ def _is_there(module: str) -> bool:
         return False
 
 
-def with_all_missing(told: str, parts: Iterable[str]) -> str:
+def with_all_missing(text: str, parts: Iterable[str]) -> str:
     """Extend an error about one missing part so that it names all of ``parts`` that are missing."""
-    before, command, first = told.rpartition(install_command(""))
+    before, command, first = text.rpartition(install_command(""))
     return before + command + " ".join((first, *(part for part in missing(parts) if part != first)))

@@ -79,8 +79,8 @@ KEY_MAP: Final = (
 )
 _NAMES: Final = {"up": "↑", "down": "↓", "left": "←", "right": "→", " ": "Space", "\n": "Enter", "\t": "Tab"}
 #: Asks the terminal to report when its window gains and loses the keyboard focus, or to stop reporting.
-TELL_FOCUS: Final = "\x1b[?1004h"
-TELL_NO_FOCUS: Final = "\x1b[?1004l"
+REPORT_FOCUS: Final = "\x1b[?1004h"
+IGNORE_FOCUS: Final = "\x1b[?1004l"
 _FOCUS: Final = {
     b"\x1b[I": "this window receives keys again",
     b"\x1b[O": "another window receives the keys: they have no effect here",

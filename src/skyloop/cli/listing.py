@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from skyloop.network import FabricSettings
     from skyloop.proxy.records import Tenure
 
-ANSWER_WITHIN_S = 1.0
+ANSWER_WITHIN_S = 1.0  #: time limit for each proxy; a suspended one does not answer
 HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW IT ENDED")
 
 
@@ -72,7 +72,7 @@ def list_proxies(
 
 
 def none_runs(settings: FabricSettings | None) -> str:
-    """Return a message that says that no proxy was found here or on the network, and whose proxies run here."""
+    """Return a message that no proxy was found here or on the network. It names other users whose proxies run here."""
     also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
     others = of_others()
     ours = f"No proxy of yours is running on this host{also}" if others else f"No proxy is running on this host{also}"
@@ -80,7 +80,7 @@ def none_runs(settings: FabricSettings | None) -> str:
 
 
 def of_others() -> str:
-    """Return a text that says which proxies other users run on this host, or an empty text if there are none."""
+    """Return a sentence about the proxies that other users run on this host; empty if there are none."""
     from skyloop.transport.local import names_of_others
 
     theirs = [f"{user} runs {', '.join(sorted(names))}" for user, names in sorted(names_of_others().items())]
@@ -180,11 +180,7 @@ def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop lis
 
     far = "local" not in row.transport
     return connect(
-        row.name,
-        access="observe",
-        name=name,
-        timeout_s=ANSWER_WITHIN_S,
-        network=(settings or False) if far else False,
+        row.name, access="observe", name=name, timeout_s=ANSWER_WITHIN_S, network=(settings or False) if far else False
     )
 
 

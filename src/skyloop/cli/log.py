@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 File = Annotated[
-    Path,
-    typer.Argument(metavar="FILE", help="Recording: an MCAP file written by Skyloop", autocompletion=recordings),
+    Path, typer.Argument(metavar="FILE", help="Recording: an MCAP file written by Skyloop", autocompletion=recordings)
 ]
 DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Recorded drone [the first]")]
 _EXAMPLE: Final = "Example: skyloop log "
@@ -65,10 +64,7 @@ def _log() -> None:
 
 
 @log.command(short_help="Show a recording's contents", epilog=f"{_EXAMPLE}info flight.mcap")
-def info(
-    file: File,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
-) -> None:
+def info(file: File, json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False) -> None:
     """Show channels with counts, rates, gaps, missing samples and delays; also drops, and problems with the file."""
     from skyloop.recording.review.summary import summarise
 
@@ -129,8 +125,7 @@ def report(
 @log.command(short_help="Export samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
 def export(
     files: Annotated[
-        list[Path],
-        typer.Argument(metavar="FILE...", help="Recording; several for lerobot", autocompletion=recordings),
+        list[Path], typer.Argument(metavar="FILE...", help="Recording; several for lerobot", autocompletion=recordings)
     ],
     to: Annotated[Form, typer.Option("--to", help="csv and parquet: one file per channel")] = Form.CSV,
     output: Annotated[
@@ -202,8 +197,7 @@ def export(
 
 
 @log.command(
-    short_help="Compare the commands of two recordings",
-    epilog=f"{_EXAMPLE}compare old.mcap new.mcap -o both.html",
+    short_help="Compare the commands of two recordings", epilog=f"{_EXAMPLE}compare old.mcap new.mcap -o both.html"
 )
 def compare(
     old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording", autocompletion=recordings)],
@@ -252,7 +246,7 @@ def recover(
     from skyloop.recording.review import summary as mending
 
     recording = _open(file)
-    with progress_bar("looking") as progress:
+    with progress_bar("checking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
         tell(f"{file} is complete: there is nothing to repair")
@@ -260,7 +254,7 @@ def recover(
             print_json({"file": file, "saved": None})
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
-    with progress_bar("mending") as progress:
+    with progress_bar("repairing") as progress:
         saved = mending.recover(recording, target, progress)
     if json:
         print_json({"file": file, "saved": saved})
@@ -365,7 +359,6 @@ def info_parts(recording: Recording, summary: Summary) -> Iterator[RenderableTyp
 
 
 def _listing(rows: Sequence[tuple[Path, Described]]) -> Table:
-    """Return the recordings in a folder as a table."""
     from skyloop.recording.listing import shown_name
 
     table = Table(box=None)
@@ -450,7 +443,6 @@ def _exported(found: Videos, camera: str) -> Iterator[str]:
 
 
 def _comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
-    """Return the differences between two recordings, as parts to print."""
     parts = "they never diverge" if found.part_at_s is None else f"they diverge at {found.part_at_s:.2f} s"
     table = Table(named("set-point"), "RMS", "largest", "at", "compared", box=None)
     for field in found.fields:
@@ -463,7 +455,7 @@ def _comparison(found: Comparison, old: str, new: str) -> list[str | Table]:
         )
     return [
         f"{new} against {old}",
-        table if found.fields else "no set-point is in both at one time",
+        table if found.fields else "no set-point occurs in both at the same time",
         f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
         f"the same kind of action {found.same_action:.1%} of the time; {parts}",
     ]

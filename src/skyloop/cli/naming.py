@@ -15,7 +15,7 @@ import typer
 
 from skyloop.errors import UsageError
 
-ANSWER_WITHIN_S: Final = 2.0
+ANSWER_WITHIN_S: Final = 2.0  #: time limit for a completion that asks a drone
 MULTICAST: Final = "multicast"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
@@ -45,16 +45,14 @@ def parameter_names(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def network_places(incomplete: str) -> list[str]:
     """Return ``multicast``, the only network place that is not an address."""
-    return [place for place in ("multicast",) if place.startswith(incomplete)]
+    return [MULTICAST] if MULTICAST.startswith(incomplete) else []
 
 
 def recordings(incomplete: str) -> list[str]:
-    """Return recordings, and folders that may contain recordings."""
     return files_ending(incomplete, {".mcap"})
 
 
 def python_files(incomplete: str) -> list[str]:
-    """Return Python files, and folders that may contain them."""
     return files_ending(incomplete, {".py"})
 
 
@@ -102,8 +100,7 @@ NetworkOption = Annotated[
     ),
 ]
 KeysOption = Annotated[
-    Path | None,
-    typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]"),
+    Path | None, typer.Option("--keys", metavar="DIR", help=f"Network: folder of an identity [{KEYS_VARIABLE}]")
 ]
 PriorityOption = Annotated[
     int, typer.Option("--priority", metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")
@@ -124,11 +121,7 @@ def keys_directory() -> Path:
 
 
 def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
-    """Return the drone that a command is for.
-
-    ``default``: used if neither is given; if None, a name is required. Raise ``UsageError`` unless exactly one drone is
-    given.
-    """
+    """Return the drone that a command is for; ``default`` if none is given (None: then one is required)."""
     if name is not None and drone is not None and name != drone:
         raise UsageError(f"NAME {name} and --drone {drone} name two drones: give only one")
     chosen = name or drone or default
@@ -138,10 +131,7 @@ def one_drone(name: str | None, drone: str | None, default: str | None = None) -
 
 
 def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
-    """Return the drones that a command is for, each once: first those given as NAME, then those given as ``--drone``.
-
-    Raise ``UsageError`` if no drone is given although one is required.
-    """
+    """Return the drones that a command is for, each once: those given as NAME, then those given as ``--drone``."""
     chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
     if needed and not chosen:
         raise UsageError(f"no drone given: give NAME or --drone NAME; {_running()}")
@@ -154,10 +144,7 @@ def _running() -> str:
 
 
 def join_network(network: str | None, keys: Path | None) -> None:
-    """Search the network that the options specify, in this process and its children.
-
-    Raise ``UsageError`` if an address or the folder is invalid, or if keys are given without a network.
-    """
+    """Search the network that the options specify, in this process and its children."""
     if network is None and keys is None:
         return
     from skyloop.network.config import choose

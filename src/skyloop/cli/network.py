@@ -53,8 +53,7 @@ ListenOption = Annotated[
 #: The former option for routers, used before ``--network`` accepted their addresses.
 ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
-    bool,
-    typer.Option("--multicast/--no-multicast", help="Network: be found by UDP multicast, if --network names it"),
+    bool, typer.Option("--multicast/--no-multicast", help="Network: be found by UDP multicast, if --network names it")
 ]
 KeysOption = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Network: folder of this proxy's identity [SKYLOOP_KEYS]")
@@ -69,16 +68,9 @@ MakeEnd = Callable[[str, str], "TransportServer"]
 
 
 def settings_of(
-    network: str | None,
-    listen: list[str] | None,
-    connect: list[str] | None,
-    multicast: bool,
-    keys: Path | None,
+    network: str | None, listen: list[str] | None, connect: list[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings | None:
-    """Return the settings specified by the options, or None to stay on this host.
-
-    Raise ``UsageError`` if an option requires ``--network``, or is invalid.
-    """
+    """Return the settings specified by the options, or None to stay on this host."""
     if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
         for option, value in given.items():
@@ -91,10 +83,7 @@ def settings_of(
 def places(
     network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
 ) -> FabricSettings:
-    """Return a network's settings from the value of ``--network`` and the related options.
-
-    Raise ``UsageError`` if an address or the folder is invalid, or if no place is given.
-    """
+    """Return a network's settings from the value of ``--network`` and the related options."""
     from skyloop.network.config import serving
 
     return serving(network, listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
@@ -117,16 +106,13 @@ def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | No
 
 
 def metrics_beside(where: str | None) -> Beside | None:
-    """Return the metrics server to run alongside a process's proxies, or None without ``--metrics``.
-
-    Raise ``UsageError`` if ``where`` is not an address.
-    """
+    """Return the metrics server to run alongside a process's proxies, or None without ``--metrics``."""
     if where is None:
         return None
     from skyloop.metrics import serving_beside
     from skyloop.metrics.endpoint import parse_where
 
-    parse_where(where)
+    parse_where(where)  # reports an invalid address before anything starts
     return serving_beside(where, tell)  # on standard error, because programs read the proxies' lines on standard output
 
 
@@ -154,8 +140,7 @@ def settle(options: SimOptions) -> None:
 # A router -------------------------------------------------------------------------------------------------------
 
 
-ROUTER_PORT: Final = 7447
-_POLL_S: Final = 0.2
+_POLL_S: Final = 0.2  # interval between checks for signals and newer keys
 
 
 def router(
@@ -186,7 +171,7 @@ def router(
     from skyloop.network.config import Part
     from skyloop.network.session import Session, acquire, release, renewed
 
-    everywhere = f"{config.all_interfaces()}:{ROUTER_PORT}"
+    everywhere = f"{config.all_interfaces()}:{config.DEFAULT_PORT}"
     chosen = places(network, listen or [everywhere], connect, multicast, keys)
     if chosen.identity is not None:
         chosen.identity.require_router()
@@ -226,8 +211,7 @@ keys = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop keys "
 LabOption = Annotated[
-    Path | None,
-    typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys"),
+    Path | None, typer.Option("--dir", metavar="DIR", help="The lab's folder", show_default="~/.config/skyloop/keys")
 ]
 
 
@@ -278,8 +262,7 @@ def issue(
 
 @keys.command(short_help="Show who has keys, and until when", epilog=f"{_EXAMPLE}show")
 def show(
-    directory: LabOption = None,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False,
+    directory: LabOption = None, json: Annotated[bool, typer.Option("--json", help="Print one JSON object")] = False
 ) -> None:
     """List all identities: role, drones, expiry. --dir may also be an identity's own folder, to show its copy.
 

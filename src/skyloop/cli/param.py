@@ -22,7 +22,7 @@ KINDS: Final = {
     ParameterType.INT: "a whole number",
     ParameterType.FLOAT: "a number",
     ParameterType.VECTOR: "numbers such as 0.1,0,-0.5",
-    ParameterType.TEXT: "a text",
+    ParameterType.TEXT: "text",
 }
 
 
@@ -83,10 +83,7 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """Parse a value typed by a person, according to the parameter's type.
-
-    Raise ``UsageError`` if the value has the wrong type.
-    """
+    """Parse a value typed by a person, according to the parameter's type."""
     try:
         match parameter.type:
             case ParameterType.BOOL:
@@ -110,18 +107,16 @@ def table(parameters: list[Parameter]) -> list[str]:
 
 
 def shorten(value: str) -> str:
-    """Return a value, shortened so that it fits into a table."""
     return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
 def details(parameter: Parameter) -> list[str]:
-    """Return all information about one parameter."""
     p = parameter
     rows = [
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),
         ("  allowed", allowed(p) or KINDS[p.type]),
         ("  default", "" if p.default is None else show(p.default)),
-        ("  momentary", "writing it acts once" if p.momentary else ""),
+        ("  momentary", "each write acts once" if p.momentary else ""),
         ("  what", p.description),
     ]
     return columns([row for row in rows if row[1]])

@@ -26,9 +26,9 @@ if TYPE_CHECKING:
     from skyloop.processing import Settings, Status
     from skyloop.vision.object_tracks import Detection, ObjectDetector
 
-LINE_EVERY_S: Final = 1.0
-_LOOK_S: Final = 0.1
-_MOST_WORKERS: Final = 64
+LINE_EVERY_S: Final = 1.0  #: interval between lines of progress
+_POLL_S: Final = 0.1  # interval at which a group of workers is checked
+_MOST_WORKERS: Final = 64  # maximum of --workers
 MOST: Final = 64  #: only the most certain detections are published, because a result is limited to 32 768 bytes
 
 
@@ -61,7 +61,7 @@ def process(
 ) -> None:
     """Process the newest frames of a drone with your own class, and publish the results. Read-only.
 
-    The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
+    The class has a method process(self, frame) that returns numbers, strings, lists, dicts, dataclasses or small NumPy
     arrays; read them with drone.results("NAME") and Controller.on_result. Progress is printed as one line per second.
     """
     from skyloop.processing import Settings, load_processor
@@ -118,12 +118,7 @@ def _lines(line: Callable[[], str], ended: threading.Event) -> None:
 
 
 def _lead(
-    workers: int,
-    settings: Settings,
-    target: str,
-    drone: str,
-    seconds: float | None,
-    show: Callable[[Status], str],
+    workers: int, settings: Settings, target: str, drone: str, seconds: float | None, show: Callable[[Status], str]
 ) -> None:
     """Run several workers, each in its own process, so that none has to wait for another worker's GIL."""
     from skyloop.processing.group import Group, child_command
@@ -133,7 +128,7 @@ def _lead(
     due = time.monotonic() + LINE_EVERY_S
     with Group(child_command(_arguments(settings, target, drone, seconds)), workers, tell) as group:
         while (ended := group.code) is None:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
             status = group.status
             if time.monotonic() >= due and status is not None:
                 due = max(due + LINE_EVERY_S, time.monotonic())
@@ -158,12 +153,10 @@ def _arguments(settings: Settings, target: str, drone: str, seconds: float | Non
 
 
 def show_text(status: Status) -> str:
-    """Return a line for users."""
     return f"{time.strftime('%H:%M:%S')}  {status}"
 
 
 def show_json(status: Status) -> str:
-    """Return a line of output for programs."""
     return json_text(status)
 
 
@@ -235,7 +228,6 @@ class DetectionProcessor:
         self._classes = frozenset(classes)
 
     def process(self, frame: Frame) -> Output:
-        """Detect objects in one frame."""
         found = [one for one in self._detector.detect(frame) if not self._classes or one.class_name in self._classes]
         found = found[:MOST]
         return Output({"detections": [_value(one) for one in found]}, [s for one in found for s in _shapes(one)])

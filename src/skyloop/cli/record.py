@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 0.25  # used on a terminal
 LINE_EVERY_S: Final = 1.0  # used if the output is a pipe
-_LOOK_S: Final = 0.5
+_POLL_S: Final = 0.5  # interval at which a viewer's subscriptions are checked
 
 
 def record(
@@ -139,8 +139,7 @@ def view(
     foxglove: Annotated[bool, typer.Option("--foxglove", help="Serve Foxglove, on this machine only")] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="Start Rerun's viewer and show them in it")] = False,
     host: Annotated[
-        str,
-        typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones"),
+        str, typer.Option(metavar="ADDRESS", help="Address; beyond loopback, anyone who can reach it sees the drones")
     ] = "127.0.0.1",
     port: Annotated[
         int | None,
@@ -221,7 +220,8 @@ def _watch(view: View, seconds: float) -> None:
     end = time.monotonic() + seconds
     before: dict[str, list[str]] = {}
     while (left := end - time.monotonic()) > 0:
-        time.sleep(min(_LOOK_S, left))
+        time.sleep(min(_POLL_S, left))
         if (now := view.subscribed) != before:
             before = now
-            typer.echo("; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items()) or "nobody looks")
+            words = "; ".join(f"{name}: {', '.join(channels)}" for name, channels in now.items())
+            typer.echo(words or "no subscribers")

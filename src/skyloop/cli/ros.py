@@ -34,8 +34,7 @@ def ros(
         str | None, typer.Option(metavar="ID", help="DDS domain, 0 to 101 [ROS_DOMAIN_ID]", show_default=False)
     ] = None,
     subnet: Annotated[
-        bool,
-        typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in range can fly"),
+        bool, typer.Option("--subnet", help="Let other machines find it: ROS 2 has no keys, anyone in range can fly")
     ] = False,
     ros_args: Annotated[
         str, typer.Option(metavar="ARGS", help='For ROS 2, in quotes: --ros-args "-r cmd_vel:=teleop"')

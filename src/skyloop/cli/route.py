@@ -103,13 +103,13 @@ def _run(flight: FlyRoute) -> None:
             tell(KEYS)
         acts = {"p": flight.pause, "r": flight.resume, "s": flight.skip}
 
-        def look() -> bool:
+        def read_keys() -> bool:
             for key in pressed(0.0) if pressed is not None else ():
                 if key.lower() in acts:
                     acts[key.lower()]()
             return pressed is None and flight.law.state == "paused"  # without a keyboard, the route can't be resumed
 
-        flight.run(until=look)
+        flight.run(until=read_keys)
     if flight.law.state == "paused":
         tell(f"paused: {flight.law.problem or 'as asked'}")
 

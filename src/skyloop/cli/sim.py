@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
     Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
 
-MOST_DRONES = 100
+MOST_DRONES = 100  #: maximum value of --drones
 OWN_OPTIONS = ("world", "seed", "speed")
 NAME = "sim"
 FIXED_BY_FIRMWARE = frozenset({"cameras", "width", "height", "fps", "latency", "native", "position", "truth", "rate"})
 LOOPBACK = "127.0.0.1"
-MOST_DELAY_S = 10.0
-PORT_BASE: Final = 5550
-PORTS_APART: Final = 10
-LOOK_UP_S: Final = 0.2
+MOST_DELAY_S = 10.0  #: maximum value of --delay
+PORT_BASE: Final = 5550  #: --port-base of an AR.Drone that uses the usual ports
+PORTS_APART: Final = 10  #: distance between the ports of one AR.Drone and those of the next
+_POLL_S: Final = 0.2  # interval between checks for signals
 
 
 def sim(
@@ -134,8 +134,8 @@ def sim(
         net.settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
         net.warn_if_open(network_settings, names)
-        look, beside = net.key_changes(network_settings), net.metrics_beside(metrics)
-        _serve_proxies(uris, options, names, net.server_ends(network_settings), look, beside)
+        poll, beside = net.key_changes(network_settings), net.metrics_beside(metrics)
+        _serve_proxies(uris, options, names, net.server_ends(network_settings), poll, beside)
         return
     if metrics is not None:
         raise UsageError("--metrics is for proxies, and with --firmware there is none: leave it out")
@@ -160,10 +160,7 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 
 
 def _world_options(uris: list[VehicleUri], drones: int) -> SimOptions:
-    """Return the options of the world that the drones share.
-
-    Raise ``UsageError`` if an option is invalid, or if the drones can't share a world.
-    """
+    """Return the options of the world that the drones share."""
     from skyloop.vehicles.sim.options import options_of
 
     if len(uris) > drones:
@@ -181,7 +178,7 @@ def _serve_proxies(
     options: SimOptions,
     names: list[str],
     make_end: net.MakeEnd,
-    look: Callable[[], list[str]] | None,
+    poll: Callable[[], list[str]] | None,
     beside: Beside | None,
 ) -> None:
     from skyloop.proxy import Proxy
@@ -194,11 +191,11 @@ def _serve_proxies(
     proxies = [
         Proxy(driver, make_end(each, str(driver.uri)), name=each) for driver, each in zip(drivers, names, strict=True)
     ]
-    run(proxies, look=look, beside=beside)
+    run(proxies, poll=poll, beside=beside)
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """Return the address of the vehicles. Raise ``UsageError`` if an option does not exist, or its value is invalid."""
+    """Return the address of the vehicles. ``others``: options of the form KEY=VALUE."""
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")
@@ -335,10 +332,7 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's.
-
-    Raise ``UsageError`` if the first address is not IPv4, or if there is no next address.
-    """
+    """Return the address of a Tello. All use the same port, and each one's address follows the previous one's."""
     if drone == 0:
         return base
     try:
@@ -348,10 +342,7 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports.
-
-    Raise ``UsageError`` if a port is out of range.
-    """
+    """Return an AR.Drone's ports: ``base`` plus 10 for each preceding drone; if it is 0, any free ports."""
     from skyloop.vehicles.ardrone.emulator import Ports
 
     if base == 0:
@@ -372,10 +363,8 @@ def _run(firmwares: Sequence[Emulated]) -> None:
             started.enter_context(firmware)
         for firmware in firmwares:
             print(f"ready {describe(firmware)}", flush=True)
-        while not shutdown.requested.wait(
-            LOOK_UP_S
-        ):  # poll, because a signal delivered to another thread does not wake this one
-            pass
+        while not shutdown.requested.wait(_POLL_S):
+            pass  # poll, because a signal delivered to another thread does not wake this one
 
 
 def describe(firmware: Emulated) -> str:

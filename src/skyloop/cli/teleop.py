@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli import naming
-from skyloop.cli.keyboard import KEY_MAP, TELL_FOCUS, TELL_NO_FOCUS, Deflection, Hands, Keyboard, Order
+from skyloop.cli.keyboard import IGNORE_FOCUS, KEY_MAP, REPORT_FOCUS, Deflection, Hands, Keyboard, Order
 from skyloop.errors import AuthorityError, SkyloopError
 from skyloop.extend import Known, commands, let_go
 from skyloop.messages import LinkState
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
 PERIOD_S: Final = 0.05  #: interval at which the position of a moved stick is resent; each press is sent immediately
-REFRESH_HZ: Final = 8
-EVENTS_SHOWN: Final = 3
+REFRESH_HZ: Final = 8  #: of the display
+EVENTS_SHOWN: Final = 3  #: number of newest events in the display
 GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: the gains selected by + and -
 
 
@@ -81,7 +81,7 @@ class Teleop:
         console = Console()
         with (
             keyboard,
-            _focus_told(console),
+            _focus_reported(console),
             Live(console=console, get_renderable=self.picture, refresh_per_second=REFRESH_HZ),
         ):
             while True:
@@ -157,12 +157,12 @@ class Teleop:
 
     def _why_not(self) -> str:
         """Return the reason why the newest set-point has no effect."""
-        link, told = self._drone.link, commands(self._drone).newest_outcome
+        link, outcome = self._drone.link, commands(self._drone).newest_outcome
         if link.application not in (LinkState.UP, LinkState.DEGRADED):
             return f"the link is {link.application.value} ({link.reason})"
         if self._drone.authority.state != "held":
             return "control has been requested"
-        return told.text if told is not None and told.text else "nothing can be sent now"
+        return outcome.text if outcome is not None and outcome.text else "nothing can be sent now"
 
     def picture(self) -> Group:
         """Return the whole display, with the most important parts first; the end is cut off if it does not fit."""
@@ -176,13 +176,13 @@ class Teleop:
 
 
 @contextmanager
-def _focus_told(console: Console) -> Iterator[None]:
+def _focus_reported(console: Console) -> Iterator[None]:
     """Ask the terminal to report whether its window has the keyboard focus."""
     try:
-        console.file.write(TELL_FOCUS if console.is_terminal else "")
+        console.file.write(REPORT_FOCUS if console.is_terminal else "")
         yield
     finally:
-        console.file.write(TELL_NO_FOCUS if console.is_terminal else "")
+        console.file.write(IGNORE_FOCUS if console.is_terminal else "")
         console.file.flush()
 
 

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Column
 
-_PIPE_COLUMNS: Final = 10_000
+_PIPE_COLUMNS: Final = 10_000  # wider than any table
 _PLAIN_ERRORS: Final = "skyloop.plain"
 #: Replacements for characters missing from a terminal's encoding; other characters lose their accents or become "?".
 _PLAIN: Final = {
     **{"✓": "ok", "✗": "x", "→": "->", "←": "<-", "↑": "^", "↓": "v", "–": "-", "−": "-", "─": "-", "│": "|", "·": "."},
     **{"×": "x", "°": " deg", "µ": "u", "μ": "u", "±": "+-", "≤": "<=", "≥": ">=", "π": "pi", "ω": "w", "√": "sqrt"},
 }
-_RED: Final = 31
+_RED: Final = 31  # colour codes of ECMA-48 ("ANSI")
 _YELLOW: Final = 33
 #: Colours of output lines, by the words at their beginning.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
@@ -45,11 +45,8 @@ def _plain(error: UnicodeError) -> tuple[str, int]:
     if not isinstance(error, UnicodeEncodeError):
         raise error
     lacking = error.object[error.start : error.end]
-    return "".join(_PLAIN.get(one) or _unaccented(one) or "?" for one in lacking), error.end
-
-
-def _unaccented(character: str) -> str:
-    return unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
+    bare = (unicodedata.normalize("NFKD", one).encode("ascii", "ignore").decode() for one in lacking)
+    return "".join(_PLAIN.get(one) or letter or "?" for one, letter in zip(lacking, bare, strict=True)), error.end
 
 
 def tell(text: str) -> None:
@@ -161,7 +158,6 @@ _PLAIN_WORDS: Final = (
 
 
 def error_text(error: SkyloopError) -> str:
-    """Return an error's message for the command line."""
     hint = _HINTS.get(error.hint) if error.hint is not None else None
     return f"{error.reason}; {hint}" if hint else error.reason
 
@@ -172,7 +168,7 @@ def usage_text(error: Any, name: str) -> str:
     if type(error).__name__ == "NoArgsIsHelpError":
         return str(error.message)
     path = context.command_path if context is not None else name
-    lines = [f"{path}: {_said(error)}"]
+    lines = [f"{path}: {_message(error)}"]
     if context is not None:
         lines.append(context.get_usage())
         if context.command.epilog:
@@ -181,7 +177,7 @@ def usage_text(error: Any, name: str) -> str:
     return "\n".join(lines)
 
 
-def _said(error: Any) -> str:
+def _message(error: Any) -> str:
     kind, param = type(error).__name__, getattr(error, "param", None)
     what = _named(param)
     if kind == "MissingParameter":

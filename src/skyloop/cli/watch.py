@@ -25,11 +25,11 @@ from skyloop.messages import Event, Failsafe, Feedback, ReturnPhase, Severity
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-REFRESH_HZ: Final = 8
+REFRESH_HZ: Final = 8  #: of the live display
 WIDE_COLUMNS: Final = 60  #: at this width and above, two facts are shown side by side
 ROOMY_COLUMNS: Final = 90  #: at this width and above, there is space between them
-LINE_EVERY_S: Final = 1.0
-EVENTS_SHOWN: Final = 8
+LINE_EVERY_S: Final = 1.0  #: interval between lines if the output is not a terminal
+EVENTS_SHOWN: Final = 8  #: number of newest events in the live display
 COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
 
 
@@ -128,7 +128,6 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """Return the complete display."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 

@@ -9,7 +9,7 @@ import msgspec
 
 from skyloop.drivers.registry import driver_class
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.errors import FileFormatError, ParameterError, SkyloopError, UsageError
+from skyloop.errors import FileFormatError, SkyloopError, UsageError
 from skyloop.files import decoded, expand
 from skyloop.messages import Value
 from skyloop.proxy.parameters import check_presets
@@ -18,7 +18,7 @@ from skyloop.transport.base import check_name
 from skyloop.zones import ZONES
 
 HOST: Final = "host"  #: default name of a host
-#: Address schemes for which each address creates a new vehicle, so that two vehicles may have the same address.
+#: Schemes where every use of an address creates a new vehicle, so that two vehicles may share one.
 MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 T = TypeVar("T")
@@ -102,7 +102,7 @@ class Fleet(msgspec.Struct, frozen=True):
 
 
 def read_fleet(path: Path) -> Fleet:
-    """Read a host's vehicle file. Relative paths of key folders in the file start from the file's own folder."""
+    """Read a host's vehicle file. Paths of key folders in it are relative to the file's own folder."""
     path = expand(path)
     try:
         with path.open("rb") as file:
@@ -210,5 +210,5 @@ def _checked(place: Place, key: str, check: Any) -> Any:
         return check()
     except FileFormatError:
         raise
-    except (UsageError, ParameterError, SkyloopError) as error:
+    except SkyloopError as error:
         raise place.error(key, error.reason) from None

@@ -29,7 +29,7 @@ from skyloop.host.threads import (
     Ticker,
     Watchdog,
 )
-from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, of_proxy, reason_of
+from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of, row_of
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import at_once
@@ -50,7 +50,7 @@ Announce = Callable[[str], None]
 
 
 class Host:
-    """Serves vehicles on shared threads, from construction to :meth:`close`. Any thread.
+    """Serves vehicles on shared threads, from construction to :meth:`close`. Thread-safe.
 
     ``announce`` is called with a line of text for users when a vehicle joins, fails or leaves. ``make`` creates the
     driver for the address of a vehicle in this process.
@@ -167,7 +167,7 @@ class Host:
             if self.vehicles.get(name) is vehicle:
                 del self.vehicles[name]
         self.announce(f"removed {name}")
-        return status if proxy is None else msgspec.structs.replace(status, **of_proxy(proxy))
+        return status if proxy is None else msgspec.structs.replace(status, **row_of(proxy))
 
     def _end(
         self,
@@ -213,7 +213,7 @@ class Host:
         return rows
 
     def publish_keys(self, change: str) -> None:
-        """Publish updates about the network's keys to all clients."""
+        """Publish an update about the network's keys to all clients."""
         for proxy in self.proxies():
             proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
@@ -233,14 +233,14 @@ class Host:
             def end(vehicle: HostedVehicle) -> None:
                 self._end(vehicle, within_s, reason, lambda: hurry() or interrupted.is_set())
 
-            def tell(vehicle: HostedVehicle) -> None:
+            def order_landing(vehicle: HostedVehicle) -> None:
                 if (proxy := vehicle.proxy) is not None and within_s > 0.0:
                     proxy.handler.order_landing(proxy.clock())
 
             # Use one thread per vehicle, because a driver that hangs must not keep another vehicle in the air.
             at_once(
                 {vehicle: partial(end, vehicle) for vehicle in vehicles},
-                tell=tell,
+                prepare=order_landing,
                 over=lambda vehicle: vehicle.condition is Condition.FAILED,
                 daemon=True,
             )
@@ -278,7 +278,6 @@ class Host:
             vehicle.report_stall(_STALL_S)
 
     def _on_hang(self, loop: SharedLoop, member: Any) -> None:
-        """Give up a vehicle whose driver hangs."""
         with self._lock:
             self._loops.remove(loop)
         loop.close()  # in case the thread ever returns

@@ -21,7 +21,7 @@ from skyloop.child_process import ChildProcess, RestartingChild, handed_over
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import RefusedError, SkyloopError
 from skyloop.host.fleet import VehicleSettings, decoder_of_handed, encode_handed
-from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus, network_of, of_proxy, reason_of
+from skyloop.host.vehicle import Condition, HostedVehicle, VehicleStatus, network_of, reason_of, row_of
 from skyloop.proxy import Proxy
 from skyloop.proxy.serve import run
 from skyloop.transport.base import TransportServer
@@ -35,10 +35,10 @@ LONGEST_PAUSE_S: Final = 30.0  #: maximum length of the pause before a restart
 SILENT_CHECKS: Final = 40
 STARTING_CHECKS: Final = 80  #: the same limit for the time before the process has sent its first report
 STEADY_S: Final = 60.0  #: a process that ran for this long before it died is restarted after the shortest pause
-_POLL_S: Final = 0.05
+_POLL_S: Final = 0.05  # interval at which ``hurry`` is polled
 _decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
-FAILED: Final = 1
+FAILED: Final = 1  #: exit status if the vehicle can't be served
 STATUS_EVERY_S: Final = 0.25  #: interval between reports
 
 
@@ -194,10 +194,10 @@ def serve(settings: VehicleSettings) -> None:
         now_s = time.monotonic()
         if now_s - reported_s >= STATUS_EVERY_S:
             reported_s = now_s
-            _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **of_proxy(proxy)))
+            _write(msgspec.structs.replace(row, uptime_s=now_s - began_s, **row_of(proxy)))
         return () if keys is None else keys()
 
-    run([proxy], parent_fd=0, look=report, records=True)
+    run([proxy], parent_fd=0, poll=report, records=True)
 
 
 def _write(status: VehicleStatus) -> None:

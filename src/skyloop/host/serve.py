@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from typing import Final
 
 import msgspec
@@ -34,7 +35,7 @@ from skyloop.host.host import Host, check_known
 from skyloop.host.vehicle import HostedVehicle, VehicleStatus, network_of, reason_of
 from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
-from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, on_signals
+from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, announce, on_signals
 from skyloop.toml_file import Place
 from skyloop.transport.local.directory import HOST, connect, find_directory
 from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
@@ -68,7 +69,7 @@ def serve(
         stack.callback(lambda: host.close(shutdown.reason or "its host failed"))
         if metrics is not None:
             announce(stack.enter_context(serve_proxies(host.proxies, metrics)).announcement)
-        control = ControlServer(fleet.name, Answering(host, fleet.defaults), group=group)
+        control = ControlServer(fleet.name, partial(respond, host, fleet.defaults), group=group)
         control.start()
         stack.callback(control.stop)
         host.known.update((vehicle.name, vehicle) for vehicle in fleet.vehicles)
@@ -91,35 +92,27 @@ def serve(
         host.close(shutdown.reason, land_within_s, shutdown.hurry.is_set)
 
 
-class Answering:
-    """Answers requests at a host's control socket. The defaults are for vehicles that are specified only by address."""
+def respond(host: Host, defaults: Defaults, request: Request) -> Answer:
+    """Carry out a request, on that request's own thread. ``defaults`` are for vehicles specified only by address."""
+    if isinstance(request, Remove):
+        return Answer((host.remove(request.name, land=request.land),))
+    if isinstance(request, AddNamed):
+        return Answer((_add_named(host, defaults, request).status(),))
+    if isinstance(request, Add):
+        present = {name for name, vehicle in host.vehicles.items() if vehicle.runs}
+        new = [vehicle for vehicle in request.vehicles if vehicle.name not in present]
+        problems = host.add_all(new)
+        known = {vehicle.name for vehicle in request.vehicles}
+        return Answer(tuple(row for row in host.status() if row.name in known), problems)
+    return Answer(tuple(host.status()))
 
-    def __init__(self, host: Host, defaults: Defaults) -> None:
-        self._host = host
-        self._defaults = defaults
 
-    def __call__(self, request: Request) -> Answer:
-        """Carry out a request. Runs on the control socket's thread. Raises :class:`skyloop.errors.SkyloopError`."""
-        host = self._host
-        if isinstance(request, Remove):
-            return Answer((host.remove(request.name, land=request.land),))
-        if isinstance(request, AddNamed):
-            return Answer((self._add_named(request).status(),))
-        if isinstance(request, Add):
-            present = {name for name, vehicle in host.vehicles.items() if vehicle.runs}
-            new = [vehicle for vehicle in request.vehicles if vehicle.name not in present]
-            problems = host.add_all(new)
-            known = {vehicle.name for vehicle in request.vehicles}
-            return Answer(tuple(row for row in host.status() if row.name in known), problems)
-        return Answer(tuple(host.status()))
-
-    def _add_named(self, request: AddNamed) -> HostedVehicle:
-        if request.address is None:
-            return self._host.add(check_known(self._host, request.name))
-        process = {True: "own", False: "shared", None: None}[request.own_process]
-        vehicle = Vehicle(name=request.name, address=request.address, process=process)  # type: ignore[arg-type]
-        place = Place("skyloop host add")
-        return self._host.add(settings_of(vehicle, self._defaults, place, vehicle))
+def _add_named(host: Host, defaults: Defaults, request: AddNamed) -> HostedVehicle:
+    if request.address is None:
+        return host.add(check_known(host, request.name))
+    process = {True: "own", False: "shared", None: None}[request.own_process]
+    vehicle = Vehicle(name=request.name, address=request.address, process=process)  # type: ignore[arg-type]
+    return host.add(settings_of(vehicle, defaults, Place("skyloop host add"), vehicle))
 
 
 class _Lines:
@@ -158,12 +151,6 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
             if settings is not None and settings.ring is not None:
                 polls[vehicle.keys] = settings.ring.poll
     return list(polls.values())
-
-
-def announce(line: str) -> None:
-    """Write a line to standard output."""
-    with suppress(OSError):  # no one reads the output; continue serving
-        print(line, flush=True)
 
 
 class Status(msgspec.Struct, frozen=True, tag="status"):
@@ -206,7 +193,7 @@ class Answer(msgspec.Struct, frozen=True):
 
 _requests: Final[msgspec.json.Decoder[Request]] = decoder_of_handed(Request)
 _answers: Final = msgspec.json.Decoder(Answer)
-#: Carries out a request on a separate thread. Raises :class:`skyloop.errors.SkyloopError`.
+#: Carries out a request on the request's own thread. Raises :class:`skyloop.errors.SkyloopError`.
 Responder = Callable[[Request], Answer]
 _ERRORS: Final[dict[str, type[SkyloopError]]] = {
     error.__name__: error for error in (UsageError, FileFormatError, NameTakenError, LinkError)

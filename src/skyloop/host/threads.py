@@ -22,8 +22,7 @@ from skyloop.proxy.core.autopilot import PERIOD_S
 
 #: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
 MAX_FAILURES: Final = 25
-#: Number of rounds after which a proxy does everything again, which is ten times a second.
-WHOLE_ROUNDS: Final = 5
+WHOLE_ROUNDS: Final = 5  #: a proxy does what is not urgent only every this many rounds, ten times a second
 _log = logging.getLogger(__name__)
 
 #: Called on the ticker's thread with the last error and the proxy whose ticks keep failing. It must return immediately.
@@ -52,7 +51,7 @@ class Ticker:
         self.entries = 0  #: number of times :attr:`inside` was set
         self._on_failing = on_failing
         self._failures = dict.fromkeys(proxies, 0)  # number of failures in a row, by proxy
-        self._lock = threading.Lock()  # guards the record of whose code is running
+        self._lock = threading.Lock()  # guards changes to the failures, and so to the proxies that are ticked
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True)
         self._thread.start()
@@ -69,7 +68,6 @@ class Ticker:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no proxy to tick."""
         return not self._failures
 
     def split(self, stuck: Proxy) -> Ticker:
@@ -90,7 +88,7 @@ class Ticker:
         for rounds, _ in enumerate(beats(PERIOD_S, self._closing)):
             with self._lock:
                 proxies = list(self._failures)
-            for place, proxy in enumerate(proxies, rounds):  # a fifth of the sockets per round, to spread the work
+            for place, proxy in enumerate(proxies, rounds):  # a fifth of the proxies per round, to spread the work
                 failures = self._failures.get(proxy)
                 if failures is not None:  # no other ticker has taken over
                     self._tick(proxy, whole=failures > 0 or place % WHOLE_ROUNDS == 0)
@@ -219,7 +217,7 @@ class PooledJobQueue:
 
 
 class SharedLoop(Protocol):
-    """A thread that runs the code of many vehicles: a ``Reactor`` or a ``Ticker``."""
+    """A thread that runs the code of many vehicles: a ``Reactor``, a ``Ticker`` or a ``LinkThread``."""
 
     @property
     def inside(self) -> Any:
@@ -307,7 +305,7 @@ class LinkThread:
         self._waker, self._awake = socket.socketpair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
-        self._lock = threading.Lock()  # guards what is known about whose code is running
+        self._lock = threading.Lock()  # guards what is known about the links
         self._members: dict[ServedLink, Any] = {}
         self._due_ns: dict[ServedLink, int] = {}
         self._queue: list[tuple[int, int, ServedLink]] = []  # a heap by due time; entries with outdated times are stale
@@ -330,7 +328,6 @@ class LinkThread:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no link to serve."""
         return not self._members
 
     def split(self, stuck: Any) -> LinkThread:

@@ -94,7 +94,7 @@ class HostedVehicle(ABC):
 
     @property
     def runs(self) -> bool:
-        """Return whether the vehicle has a proxy or is about to get one."""
+        """Whether the vehicle has a proxy or is about to get one."""
         return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
 
     def row(self) -> VehicleStatus:
@@ -111,8 +111,8 @@ class SharedVehicle(HostedVehicle):
     """A vehicle whose proxy uses the shared threads of this process.
 
     ``reactor`` receives the proxy's local packets, ``jobs`` serves its slow requests, and ``network`` is None if it
-    serves this host only. ``overview`` returns the rows of all vehicles in this process; if None, only this vehicle's
-    row is shown. ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its thread.
+    serves this host only. ``overview`` holds the rows of all vehicles in this process; if None, only this vehicle's row
+    is shown. ``serve_link`` moves a driver's link to a shared thread; if None, the link keeps its own thread.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class SharedVehicle(HostedVehicle):
         proxy, row = self.proxy, self.row()
         if proxy is None or self.condition is not Condition.RUNNING:
             return row
-        return msgspec.structs.replace(row, **of_proxy(proxy))
+        return msgspec.structs.replace(row, **row_of(proxy))
 
     def report_stall(self, seconds: float) -> None:
         """Publish that the driver blocks, and that the vehicle no longer shares its threads."""
@@ -215,7 +215,7 @@ class SharedVehicle(HostedVehicle):
         return True
 
 
-def of_proxy(proxy: Proxy) -> dict[str, object]:
+def row_of(proxy: Proxy) -> dict[str, object]:
     """Return the part of a row that a running proxy provides."""
     vehicle = proxy.publisher
     feedback = vehicle.feedback_now

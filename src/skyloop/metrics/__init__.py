@@ -58,7 +58,7 @@ def serve_proxies(proxies: Callable[[], Iterable[Proxy]], where: str) -> Endpoin
 def serving_beside(
     where: str, announce: Callable[[str], None]
 ) -> Callable[[Sequence[Proxy]], AbstractContextManager[object]]:
-    """Return a context for :func:`skyloop.proxy.serve.run` that serves its proxies' metrics and prints where."""
+    """Return the ``beside`` of :func:`skyloop.proxy.serve.run` that serves its proxies' metrics and announces where."""
 
     def enter(proxies: Sequence[Proxy]) -> AbstractContextManager[object]:
         endpoint = serve_proxies(lambda: proxies, where)

@@ -65,7 +65,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_failsafe", "gauge", ("vehicle", "step"), "1 for the failsafe's current step, else 0"),
         Family("skyloop_feedback_age_seconds", "gauge", _VEHICLE, "age of the vehicle's newest state"),
         Family("skyloop_feedback_published_total", "counter", _VEHICLE, "samples of feedback published"),
-        Family("skyloop_feedback_selected_total", "counter", _VEHICLE, "samples published in reduced forms"),
+        Family("skyloop_feedback_selected_total", "counter", _VEHICLE, "samples published at reduced rates"),
         Family("skyloop_feedback_missed_total", "counter", _VEHICLE, "samples that a subscriber had no room for"),
         Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands received"),
         Family("skyloop_commands_applied_total", "counter", _VEHICLE, "commands handed to the vehicle"),
@@ -102,7 +102,7 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_network_dropped_total", "counter", _VEHICLE, "dropped packets to single applications"),
         Family("skyloop_network_refused_total", "counter", _VEHICLE, "packets on a key that does not allow them"),
         Family("skyloop_network_strays_total", "counter", _VEHICLE, "packets and queries from unconnected senders"),
-        Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of a place"),
+        Family("skyloop_network_turned_away_total", "counter", _VEHICLE, "connections refused for lack of room"),
         # Metrics of the cockpit, which is a client of each proxy.
         Family(
             "skyloop_client_link_state",
@@ -111,7 +111,7 @@ FAMILIES: Final[dict[str, Family]] = {
             "1 for the current state of the link to the proxy, else 0",
         ),
         Family("skyloop_client_received_total", "counter", _CHANNEL, "samples received"),
-        Family("skyloop_client_lost_total", "counter", _CHANNEL, "samples missing by the gaps in their numbers"),
+        Family("skyloop_client_lost_total", "counter", _CHANNEL, "samples missing, from gaps in their numbers"),
         Family("skyloop_client_dropped_total", "counter", _CHANNEL, "samples overtaken by newer ones here"),
         Family("skyloop_client_malformed_total", "counter", _CHANNEL, "samples that could not be decoded"),
         Family(

@@ -114,11 +114,11 @@ def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]
         return f"the key of {who!r} already has {own} of at most {PER_KEY} connections: close some of them"
     if len(here) >= MAX_CLIENTS:
         return f"there are already {len(here)} of at most {MAX_CLIENTS} connections: close some of them"
-    lookers = sum(not flies for _, flies in here)
-    if not may_fly and lookers >= MAX_CLIENTS - FOR_PILOTS:
+    observers = sum(not flies for _, flies in here)
+    if not may_fly and observers >= MAX_CLIENTS - FOR_PILOTS:
         return (
-            f"there are already {lookers} connections of keys that may not fly this drone, and the other {FOR_PILOTS} "
-            "are reserved for pilots: close some of them"
+            f"there are already {observers} connections of keys that may not fly this drone, and the other "
+            f"{FOR_PILOTS} are reserved for pilots: close some of them"
         )
     return ""
 

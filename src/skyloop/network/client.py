@@ -73,8 +73,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         nonlocal about, before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
-            # One end may have forgotten the connection while the other has not, but not vice versa. Such a session
-            # finds no proxy or gets no answers, and Zenoh does not detect this. A new session has a new identity.
+            # One end may have forgotten the other, which still knows it. Such a session finds no proxy or gets no
+            # answers, and Zenoh does not detect this. A new session has a new identity.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -111,9 +111,9 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
 class Subscription:
     """Sorts a topic's packets on Zenoh's threads, and delivers them on the receiving thread.
 
-    ``run``: the proxy's run. Packets that others publish under its name are ignored. ``enqueue``: called with this
-    subscription, a packet (empty: a frame is due) and the packet's number, which must be passed to :meth:`deliver` in
-    order. ``reject``: called with the reason when a packet did not come from the proxy.
+    ``run``: the proxy's run. Packets that others publish under its name are ignored. ``enqueue``: called with an item
+    whose packet (empty: a frame is due) and number must be passed to :meth:`deliver` in order. ``reject``: called with
+    the reason when a packet did not come from the proxy.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class Subscription:
         topic: str,
         run: bytes,
         opener: Opener,
-        enqueue: Callable[[Subscription, bytes, int], object],
+        enqueue: Callable[[_Item], object],
         reject: Callable[[DecodeError], None],
     ) -> None:
         self._topic = topic
@@ -177,7 +177,7 @@ class Subscription:
             return
         if run == self._run and self._waiting < DEPTH and self._recent.is_new(number, packet):
             self._waiting += 1
-            self._enqueue(self, packet, number)
+            self._enqueue((self, packet, number))
 
     def _on_frame(self, sample: zenoh.Sample) -> None:
         """Queue a frame, replacing any frame that is already queued."""
@@ -198,7 +198,7 @@ class Subscription:
             self._frames[-1] = (number, header, opened[0])
         else:
             self._frames.append((number, header, opened[0]))
-            self._enqueue(self, b"", number)
+            self._enqueue((self, b"", number))
 
 
 #: Items for the receiving thread: a topic (None: sent to this end only), its packet (empty: a frame), its number.
@@ -303,9 +303,8 @@ class FabricClient(TransportClient):
             if self._ended or on == (topic in self._subscriptions):
                 return
             if on:
-                wanted = Subscription(
-                    topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
-                )
+                run, opener = bytes.fromhex(self._run), self._admission.topics
+                wanted = Subscription(topic, run, opener, self._inbox.put, self._reject)
                 self._subscriptions[topic] = wanted, wanted.declare(self.session, self._name, self._id)
             sent = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
             declared: list[Any] = []
@@ -357,7 +356,7 @@ class FabricClient(TransportClient):
         return True
 
     def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
-        """Send a packet until it is acknowledged; return False if there is no room. The caller holds the lock."""
+        """Send a packet, and again until it is acknowledged; False if there is no room. The caller holds the lock."""
         waits = self._outgoing.under_way
         if not self._outgoing.put(packet, way, own=own):
             return False
@@ -431,9 +430,6 @@ class FabricClient(TransportClient):
         else:
             return False
         return True
-
-    def _enqueue_published(self, subscription: Subscription, packet: bytes, number: int) -> None:
-        self._inbox.put((subscription, packet, number))
 
     def _reject(self, error: DecodeError) -> None:
         """Count a sample that did not come from the proxy, and log the first such sample."""

@@ -34,7 +34,7 @@ OPEN_GIVEN_MS: Final = 1500
 #: waits only for the proxy at that address. With several, it must find all proxies with the name.
 SETTLE_MS: Final = 500
 MAX_MESSAGE: Final = 1 << 27  #: maximum size of a received frame [bytes]
-#: Maximum size of a message to a proxy [bytes]. Frames travel the other way. A larger one is dropped before reassembly.
+#: Maximum size of a message to a proxy [bytes]. Frames travel the other way. Larger ones are dropped before reassembly.
 MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")
@@ -217,16 +217,16 @@ class Part(StrEnum):
 
     PROXY = "proxy"  #: listens for applications, which connect to it
     APP = "app"  #: connects to proxies
-    ROUTER = "router"  #: joins ends that can't reach one another directly
+    ROUTER = "router"  #: connects nodes that can't reach one another directly
 
 
-#: Number of keep-alive packets per lease. It is enough for some to arrive on a path that loses three packets in ten.
+#: Number of keep-alive packets per lease: enough for some to arrive on a path that loses three packets in ten.
 KEEP_ALIVES: Final = 8
 #: Number of messages queued for sending at each priority (Zenoh's maximum). Zenoh's default of 2 drops further messages
 #: within a millisecond, and ten drones in one process can report the same event at the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
-#: Override what a neighbour requests, so that no slow reader blocks another, either here or through a router. Answers
-#: travel in the same way as the queries.
+#: Override what a neighbour requests, so that no slow reader blocks another, either here or through a router. Zenoh
+#: sends replies with the settings of their query.
 _NOBODY_WAITS: Final = {
     "id": "nobody waits",
     "messages": ["put", "delete", "query"],
@@ -246,7 +246,8 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
     # Disconnect a neighbour that accepts none of Zenoh's own declarations for this long. Until then, it blocks one of
     # Zenoh's few receiving threads. All other messages are dropped when a link is congested.
     blocked_us = lease_ms * 1000
-    found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
+    kinds = _autoconnect(part, bool(connect))
+    found_by_search = {"peer": kinds, "router": kinds}
     waits = settings.multicast or len(settings.connect) != 1 or part is not Part.APP
     usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]  # with keys, nothing is accepted unencrypted
     found: dict[str, Any] = {
@@ -341,7 +342,7 @@ def free_port(host: str) -> int:
     raise LinkError(f"no port is free for TCP and UDP at {host}")
 
 
-def _called(part: Part, has_addresses: bool) -> list[str]:
+def _autoconnect(part: Part, has_addresses: bool) -> list[str]:
     """Return the kinds of nodes to connect to when they are discovered.
 
     Only applications connect to proxies, so a hundred proxies have no links to one another. A node that was given

@@ -58,7 +58,7 @@ class ServerConnection:
         self._taken = 0  # acknowledge the application's packets up to this number; 0: nothing to acknowledge
         self.topics: dict[str, int] = {}  #: subscribed topics, each with the number of the last acknowledged packet
         self.paces: dict[str, Pace] = {}  #: for topics where only the newest packet matters
-        self.left = False  #: the application has unsubscribed for good from every topic
+        self.left = False  #: the connection has ended and lost its topics, so it gets no new ones
 
     def may_command(self, drone: str) -> bool:
         """Return whether the application's proven identity permits more than queries about this drone."""
@@ -70,7 +70,7 @@ class ServerConnection:
         return number - self.topics.get(topic, number) > DEPTH
 
     def took(self, topic: str, number: int, now_s: float) -> bool:
-        """Record up to which packet the application has acknowledged a topic (if empty, the packets to it alone).
+        """Record that packets up to this number were acknowledged: a topic's, or if empty, those sent to it alone.
 
         Returns whether more packets that go only to this application may be waiting.
         """
@@ -102,7 +102,6 @@ class ServerConnection:
             self._own.append(packet)
 
     def acknowledge(self, number: int) -> None:
-        """Acknowledge the application's packets up to this number."""
         with self.lock:
             self._taken = max(self._taken, number)
 

@@ -22,7 +22,7 @@ DEPTH: Final = 256  #: maximum number of unacknowledged packets to one end; furt
 MAX_BYTES: Final = 1 << 20  #: total size of unacknowledged packets to one end; further packets are refused [bytes]
 RECENT_PACKETS: Final = 64  #: number of recent packets that are remembered to detect repeats
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: acknowledge a topic after this number of packets
-#: Number of packets in flight. Zenoh queues as many per link before it drops one (``config._QUEUES``).
+#: Number of packets in flight. Zenoh queues this many per link before it drops one (``config._QUEUES``).
 ON_THE_WAY: Final = 16
 ON_THE_WAY_BYTES: Final = 1 << 18  #: total size of packets in flight [bytes]
 ACKNOWLEDGE_EVERY_S: Final = 0.15  #: acknowledgement interval if only the newest packet matters (:class:`Pace`)
@@ -135,7 +135,7 @@ class Incoming:
 
 
 class AckPolicy:
-    """Decides when to acknowledge a topic's packets: within ``every_s`` [s] of their arrival. Not thread-safe."""
+    """Decides which of a topic's packets to acknowledge: one in many, or one every ``every_s``. Not thread-safe."""
 
     def __init__(self, every_s: float = math.inf) -> None:
         self._acknowledged = 0
@@ -171,12 +171,10 @@ class Pace:
         self._since_s = math.inf  # send time of the oldest unacknowledged packet, or a later time
 
     def may_send(self, now_s: float) -> bool:
-        """Return whether another packet may be sent now."""
         stands = self._eager and now_s - self._since_s > STANDS_S
         return not stands or now_s - self._sent_s >= SLOW_S
 
     def sent(self, number: int, now_s: float) -> None:
-        """Record that a packet was sent."""
         self._newest, self._sent_s = number, now_s
         self._since_s = min(self._since_s, now_s)
 

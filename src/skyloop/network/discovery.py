@@ -39,7 +39,6 @@ RUNS_PER_NAME: Final = 8  #: maximum number of proxies listed per name; a split 
 SEARCH_S: Final = 0.25  #: time to wait for answers to a search
 YOUNG_S: Final = 1.0  #: maximum age of a session that does not need help with its search
 FORGET_S: Final = 10.0  #: a peer that a new session could not reach is not tried again for this long
-_POLL_S: Final = 0.05
 JOIN_S: Final = 1.0  #: time for a proxy to admit the application
 TIMED_OUT: Final = "Timeout"  #: text of Zenoh's error reply to a query that timed out
 MAX_CANDIDATES: Final = 4  #: with keys: maximum number of proxies of this name to ask until one proves its identity
@@ -97,8 +96,7 @@ def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tu
 
 def _settle(session: Session) -> None:
     """Wait until a new session knows the nodes within reach."""
-    while (left_s := session.opened + SETTLE_S - time.monotonic()) > 0.0:
-        time.sleep(min(left_s, _POLL_S))
+    time.sleep(max(0.0, session.opened + SETTLE_S - time.monotonic()))
 
 
 def _ask(session: Session, name: str) -> list[ProxyInfo]:
@@ -228,8 +226,8 @@ class ProxyWatch:
                 found = bool(self._runs)
             if not found and not complete:
                 raise NoAnswerError(
-                    f"the network was reached, but within {list_s:g} s not all nodes answered whether they know "
-                    f"the proxy {self._name!r}"
+                    f"the network was reached, but not all nodes listed their proxies within {list_s:g} s: the proxy "
+                    f"{self._name!r} may be among them"
                 )
             if not found:
                 others = {other for other, _ in known} - {self._name}

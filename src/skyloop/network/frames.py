@@ -23,8 +23,8 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: maximum number of frames in flight to one reader
-#: The formats of one camera's frames. Each format is encoded separately. A format split into n parts costs no more than
-#: a whole one. The default formats are not counted, so there is always room for a pilot, whatever others request.
+#: Maximum number of formats in which one camera's frames are encoded. All parts of a split format count as one format.
+#: The default formats are not counted, so there is always room for a pilot, whatever others request.
 MAX_FORMS: Final = 32
 MAX_FORMS_EACH: Final = 8  #: maximum number of formats that one connection may read
 #: A frame not acknowledged after this time is considered lost: Zenoh drops what a congested link can't carry.
@@ -78,7 +78,7 @@ class Reader:
 
 
 class Variant:
-    """One format of a camera's frames, and its readers."""
+    """One of a camera's frame formats, with the connections that read it."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
@@ -186,7 +186,6 @@ class FramePublisher:
         return ""
 
     def unsubscribe(self, key: Hashable, topic: str) -> None:
-        """Stop sending a topic's frames to a connection."""
         with self._changed, contextlib.suppress(UsageError):
             camera = VideoRequest.parse(topic).camera
             self._drop(camera, topic, key)

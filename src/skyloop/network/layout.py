@@ -44,11 +44,11 @@ ASK: Final = "ask"  #: reliable; also for observers
 ORDER: Final = "order"  #: reliable; only for pilots
 COMMAND: Final = "command"  #: best effort; the channel for commands
 WAYS: Final = (ASK, ORDER, COMMAND)
-#: Requests that observers may send. Any other kind needs the right to order, so that new kinds are safe by default.
+#: Requests that observers may send. All others are only for pilots, so that new kinds are safe by default.
 ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
 _COMMAND: Final = bytes([KINDS[Command]])
 _REQUEST: Final = bytes([KINDS[Request]])
-_REPORT: Final = encode(StreamReport("", 0))[:6]  # the whole header, so that garbage keeps its place in the order
+_REPORT: Final = encode(StreamReport("", 0))[:6]  # signature, version and kind: garbage is no report
 _POSE: Final = bytes([KINDS[VehiclePose]])  # some vehicles need poses to fly
 
 

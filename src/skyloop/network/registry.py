@@ -84,7 +84,6 @@ class ConnectionRegistry:
         self._stray_commands = 0  # number of commands and requests among those packets, not yet reported to the handler
 
     def open(self) -> None:
-        """Start admitting applications."""
         with self._lock:
             self._open = True
 
@@ -105,7 +104,6 @@ class ConnectionRegistry:
         return list(self._connections.values())
 
     def of_peer(self, peer: Peer) -> ServerConnection | None:
-        """Return a peer's connection, or None if it is gone."""
         return self._peers.get(peer.id)
 
     def of_sender(self, sender: layout.Sender) -> ServerConnection:
@@ -175,7 +173,6 @@ class ConnectionRegistry:
                 self._send_topic_key(connection, self._topic_keys.newest)
 
     def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
-        """Check the keys in a request."""
         if self._ring is not None and sender.who in self._ring.shut_out:
             raise LinkError(_SHUT_OUT)
         newest = self._topic_keys.newest if self._topic_keys else None

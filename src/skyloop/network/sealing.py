@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 TAG: Final = 16  #: number of bytes that sealing adds to a payload
 _TRAILER = struct.Struct("<IQ")  # generation and number; they are appended to the attachment, and used as the nonce
 TRAILER: Final = _TRAILER.size
-KEY_BYTES: Final = 32
-#: Number of packets by which a packet may arrive late. Datagrams can overtake resent packets, 100 a second for 10 s.
+KEY_BYTES: Final = 32  #: size of a key of ChaCha20-Poly1305
+#: How far a packet's number may be behind the newest: datagrams, 100 a second, can overtake a resent packet for 10 s.
 WIDTH: Final = 1024
 GENERATIONS: Final = 3  #: topic keys that an application keeps: the current one, the newest one, and one between
 #: Delay between sending a new topic key and first using it, so that it arrives before the packets sealed with it.

@@ -80,7 +80,7 @@ class FabricServer(TransportServer):
     def start(self, handler: ServerHandler) -> None:
         with self._lock:
             if self._started:
-                raise UsageError(f"fabric:{self._name} was started before: make a new {type(self).__name__}")
+                raise UsageError(f"fabric:{self._name} was started before: create a new {type(self).__name__}")
             self._started = True
         self._check_free()
         session = self._session = acquire(self._settings, Part.PROXY)
@@ -149,7 +149,6 @@ class FabricServer(TransportServer):
         return self._publisher.video.publish(header, pixels)
 
     def subscribers(self, topic: str) -> int:
-        """Return the number of a topic's subscribers. A camera's plain topic includes those of all its formats."""
         return self._publisher.subscribers(topic)
 
     def disconnect(self, peer: Peer, reason: str) -> None:
@@ -262,7 +261,7 @@ class FabricServer(TransportServer):
         elif isinstance(message, packets.Subscribe):
             return self._publisher.subscribe(connection, message)
         elif isinstance(message, packets.Key):
-            return False  # only proxies send packets of these kinds
+            return False  # only proxies send packets of this kind
         else:
             self._registry.send_own(connection, packets.bye(message.reason))
             self._registry.end(connection, message.reason)

@@ -226,7 +226,6 @@ def load() -> Any:
 
 
 def host_name() -> str:
-    """Return this host's name, for users."""
     return platform.node()[:64] or "?"
 
 

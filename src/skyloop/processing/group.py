@@ -20,13 +20,10 @@ USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all and has pr
 
 
 class Worker:
-    """A worker's process, which is restarted when it dies.
+    """A worker's process, which is restarted ``pause_s`` [s] after it dies.
 
-    Args:
-        number: Number of the worker for display, from 1.
-        command: Command line of the worker, which regularly prints a :class:`Status` as a JSON line on standard output.
-        report: Called on the worker's thread with a human-readable text when the worker dies.
-        pause_s: Delay before a restart [s].
+    ``command`` must regularly print a :class:`Status` as a JSON line on standard output. ``report`` is called on the
+    monitoring thread with text for users when the process dies; ``number``, from 1, is the worker's number there.
     """
 
     def __init__(self, number: int, command: Sequence[str], report: Callable[[str], None], pause_s: float) -> None:
@@ -58,10 +55,10 @@ class Group:
     """Several children running the same command. Leaving its ``with`` block ends them."""
 
     def __init__(
-        self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
+        self, command: Sequence[str], count: int, report: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
-        """Start ``count`` children; when one dies, ``tell`` is called with a message on its monitoring thread."""
-        self._workers = [Worker(number, tuple(command), tell, pause_s) for number in range(1, count + 1)]
+        """Start ``count`` children; when one dies, ``report`` is called with a message on its monitoring thread."""
+        self._workers = [Worker(number, tuple(command), report, pause_s) for number in range(1, count + 1)]
 
     @property
     def status(self) -> Status | None:

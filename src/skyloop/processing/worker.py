@@ -32,7 +32,7 @@ from skyloop.messages import ProcessorShare, Severity
 from skyloop.messages.relayed import MAX_LOG_TEXT, Shape
 
 _WANTED: Final = "a class with a method process(self, frame)"
-_DIGITS: Final = 16  #: number of digits of the code's hash
+_DIGITS: Final = 16  #: number of hexadecimal digits kept of the code's SHA-256
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +152,7 @@ def _source(kind: type[Any]) -> bytes:
         return b"" if code is None else code.co_code + repr(code.co_names).encode()
 
 
-_LOOK_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
+_POLL_S: Final = 0.1  #: interval at which run() checks whether to end while no frame arrives
 _REPORT_EVERY_S: Final = 1.0  #: minimum interval between reports of exceptions in the user's code
 _KEPT: Final = 1024  #: number of recent results and frames kept for computing rates and ages
 #: Fields summed over several workers.
@@ -251,7 +251,7 @@ class Worker:
         try:
             with self._frames as frames:
                 while not self._over(end_s):
-                    arrival = frames.wait(_LOOK_S)
+                    arrival = frames.wait(_POLL_S)
                     if arrival is not None:
                         self._work(arrival)
                     del arrival  # frees its memory for the proxy while this thread waits for the next frame

@@ -29,7 +29,7 @@ MAX_TEXT: Final = 1000  #: maximum number of characters in an event's text
 REPEAT_NS: Final = NS_PER_S  #: interval at which an event that continues is published again
 #: If a limit has not been touched for this long, touching it again starts a new episode.
 EPISODE_NS: Final = NS_PER_S
-#: The reasons why a hover or landing is abandoned.
+#: Why a hover or landing is abandoned.
 UNHEARD: Final = f"the vehicle was silent for {seconds(BELIEF_NS):g} s and may be on another flight by now"
 _ENFORCED: Final = "enforced: the vehicle's position is known again"
 _NOT_ENFORCED: Final = "not enforced: the vehicle's position is unknown"
@@ -64,7 +64,7 @@ class EventPublisher:
     def __init__(
         self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters, scrub: Callable[[str], str] = str
     ) -> None:
-        """Initialise; ``scrub`` removes secrets from a text."""
+        """Initialise; ``scrub`` removes secrets from text."""
         self._scrub = scrub
         self._publish = publish
         self._clock = clock
@@ -89,7 +89,6 @@ class EventPublisher:
             self._send([EventDraft(kind, text, severity, app, data or {})])
 
     def publish_drafts(self, *drafts: EventDraft) -> None:
-        """Publish these events, in this order."""
         with self._lock:
             self._send(drafts)
 
@@ -116,11 +115,11 @@ class EventPublisher:
     def _send(self, drafts: Sequence[EventDraft]) -> None:
         """Number events and publish them. The caller holds the lock."""
         scrub, packets = self._scrub, []
-        told = [
+        scrubbed = [
             (one, scrub(one.text), {key: scrub(it) if isinstance(it, str) else it for key, it in one.data.items()})
             for one in drafts
         ]
-        for draft, text, data in told:
+        for draft, text, data in scrubbed:
             self._seq += 1
             kind, severity, app = draft.kind, draft.severity, draft.app
             if len(text) > MAX_TEXT or not text.isascii():
@@ -165,7 +164,7 @@ class RepeatedEvents:
         self._counts: dict[Hashable, int] = {}
 
     def first(self, key: Hashable, draft: Callable[[], EventDraft]) -> bool:
-        """Count an event; return whether it is the first with its key. If so, publish it and call :meth:`begin`."""
+        """Return whether an event is the first with its key (then publish it and call :meth:`begin`), or count it."""
         count = self._counts.get(key)
         if count is None:
             return True
@@ -179,7 +178,7 @@ class RepeatedEvents:
         self._counts[key] = 0
 
     def due(self, now_ns: int) -> list[tuple[EventDraft, int]]:
-        """Return the events repeated in the last second, with counts; forget the others."""
+        """Return the totals that are due; forget the events that were not repeated."""
         due: list[tuple[EventDraft, int]] = []
         for key, (published_ns, draft) in list(self._published.items()):
             if now_ns - published_ns < REPEAT_NS:
@@ -209,13 +208,11 @@ class Episodes:
 
 
 def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
-    """Return the event for a refused command from the application ``name``."""
     text = f"{name}: {command.action.name} refused: {why}"
     return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
 
 
 def clamped_event(name: str, clamp: Clamp) -> EventDraft:
-    """Return the event for a limit that reduced a set-point from the application ``name``."""
     zone = f" ({clamp.zone})" if clamp.zone else ""
     text = f"{name}: {clamp.limit}{zone} allows {clamp.applied:.3g} of {clamp.asked:.3g}"
     data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
@@ -262,13 +259,11 @@ def drift_event(drifts: bool) -> EventDraft:
 
 
 def emergency_event(name: str) -> EventDraft:
-    """Return the event for an emergency stop by the application ``name``."""
     text = f"emergency stop by {name}"
     return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
 
 
 def failsafe_event(change: StepChange) -> EventDraft:
-    """Return the event for the start or end of a failsafe step."""
     why = REASONS.get(change.reason, change.reason)
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
@@ -282,7 +277,6 @@ def failsafe_event(change: StepChange) -> EventDraft:
 
 
 def battery_event(low: BatteryLow) -> EventDraft:
-    """Return the event for a battery below the warning level."""
     text = f"battery low: {low.battery:.0%} left"
     return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
 
@@ -314,7 +308,6 @@ class Named(Protocol):
 
 
 def name_of(sessions: Mapping[int, Named], app_id: int) -> str:
-    """Return the name of the application with this number."""
     session = sessions.get(app_id)
     return session.name if session is not None else f"application {app_id}"
 

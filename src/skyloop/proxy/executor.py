@@ -67,7 +67,7 @@ class ActionExecutor:
 
     @property
     def airborne(self) -> bool:
-        """Whether the vehicle flies or may fly. Without a reported state, it may fly after the first command."""
+        """Whether the vehicle flies, or may be flying, as :meth:`Flight.flies` decides."""
         return self.flight.flies(self.state)
 
     @property
@@ -76,7 +76,6 @@ class ActionExecutor:
         return self.autopilot is not None and self.autopilot.drifts
 
     def seen(self, now_ns: int) -> Snapshot:
-        """Return the vehicle's known state."""
         vehicle = self._publisher
         state = self.flight.state(vehicle.reported_state)
         return Snapshot(now_ns, state, vehicle.feedback_now, vehicle.link_state, vehicle.link_up)
@@ -141,7 +140,7 @@ class ActionExecutor:
         return True
 
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
-        """Hover or land without a pilot; return whether it was accepted. Failures are published rather than raised."""
+        """Hover or land without a pilot; return whether the driver accepted this. Failures are published."""
         if type(action) in self.native:
             taken = False
             try:
@@ -162,9 +161,9 @@ class ActionExecutor:
         return taken
 
     def leave(self, now_ns: int) -> None:
-        """Hover permanently. No further commands are sent.
+        """Make the vehicle hover with the last command that is sent.
 
-        A vehicle without a native hover is also stopped, as well as a single set-point can do that.
+        A vehicle without a native hover gets a set-point instead: zero velocity, or a level attitude.
         """
         if Hover in self.native or self.autopilot is None:
             self.failsafe(Hover(), now_ns)

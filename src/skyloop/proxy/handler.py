@@ -189,12 +189,11 @@ class CommandHandler(FlightSupervisor):
         return Done()
 
     def application_left(self, session: Session, now_ns: int, news: Sequence[EventDraft] = ()) -> None:
-        """Handle the end of a connection still among the sessions. ``news``: published once the vehicle hovers."""
+        """Handle the end of a session that is still listed. ``news``: published once the vehicle hovers."""
         with self._lock:
             self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns, news)
 
     def holds(self, session: Session, lease: int) -> bool:
-        """Return whether the application holds the authority under this lease."""
         with self._lock:
             holder = self.authority.holder
             return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease

@@ -50,7 +50,14 @@ PAGE_BYTES: Final = MAX_BODY - 256  #: total bytes of encoded parameters in one 
 #: A momentary parameter, such as a flip, is written within this time or not at all, as its writer waits no longer.
 MOMENT_NS: Final = 2 * NS_PER_S
 
-_KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
+_GIVEN_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "text", tuple: "a vector"}
+_TYPE_NAMES: Final = {
+    ParameterType.BOOL: "a bool",
+    ParameterType.INT: "an int",
+    ParameterType.FLOAT: "a float",
+    ParameterType.TEXT: "text",
+    ParameterType.VECTOR: "a vector",
+}
 _encoded = msgspec.msgpack.Encoder().encode
 
 
@@ -154,10 +161,10 @@ def check(parameter: Parameter, value: Value) -> Value:
             raise ParameterError(f"{parameter.name} takes {length} numbers, not {len(value)}", code=Refusal.WRONG_TYPE)
         value = tuple(_number(parameter, number) for number in value)
     elif not ((kind is ParameterType.BOOL and is_bool) or (kind is ParameterType.TEXT and isinstance(value, str))):
-        name = _KIND_NAMES.get(type(value), type(value).__name__)
+        given = _GIVEN_NAMES.get(type(value), type(value).__name__)
         unit = f" in {parameter.unit}" if parameter.unit else ""
         raise ParameterError(
-            f"{parameter.name} takes a {kind.value}{unit}, not {name} ({value!r:.60})", code=Refusal.WRONG_TYPE
+            f"{parameter.name} takes {_TYPE_NAMES[kind]}{unit}, not {given} ({value!r:.60})", code=Refusal.WRONG_TYPE
         )
     if parameter.choices and value not in parameter.choices:
         choices = ", ".join(repr(choice) for choice in parameter.choices)
@@ -189,7 +196,7 @@ def _number(parameter: Parameter, number: float) -> float:
 
 
 def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
-    """Return checked values for the proxy's own parameters; :class:`UnknownNameError` for any other name."""
+    """Check values for the proxy's own parameters and return them. Raises :class:`UnknownNameError` for other names."""
     own = {parameter.name: parameter for parameter in OWN}
     checked: dict[str, Value] = {}
 
@@ -368,8 +375,8 @@ class Parameters:
 class ParameterRequests:
     """Answers applications' requests about parameters, and applies new values. May wait for the vehicle.
 
-    ``free``: parameters that any pilot may write without the authority. These parameters also change without being
-    written. Each parameter is therefore read again every time, and changes cause no event.
+    ``free``: parameters that any pilot may write without the authority. They also change without being written, so they
+    are read from the driver whenever they are requested, and writing them causes no event.
     """
 
     def __init__(
@@ -389,7 +396,7 @@ class ParameterRequests:
         self._clock = clock
 
     def read_driver(self) -> None:
-        """Read the driver's parameters; keep the old parameters if it raises an error."""
+        """Read the driver's parameters, keeping the old ones if that fails, write waiting presets, and apply both."""
         try:
             self._parameters.refresh()
         except Exception as error:  # noqa: BLE001  it is reported, and the flight continues

@@ -1,8 +1,8 @@
 """The proxy, a node that lets any number of applications observe a vehicle and one at a time fly it.
 
 Threads: the transport's threads execute commands and pass on poses. The driver's threads publish. A ticker (50 Hz)
-    updates authority, failsafe and autopilot, and one more thread answers requests. The handler's lock is held during
-    every driver call that flies the vehicle, including those in :meth:`end`.
+updates authority, failsafe and autopilot, and one more thread answers requests. The handler's lock is held during every
+driver call that flies the vehicle, including those in :meth:`Proxy.end`.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: maximum number of characters in a proxy's name
 
-_POLL_S: Final = 0.2
+_POLL_S: Final = 0.2  # interval at which ``hurry`` is polled during a landing
 _ABANDON_S: Final = 1.0  #: time to wait for the proxy's other parts to end if the driver hangs
 _log = logging.getLogger(__name__)
 
@@ -485,5 +485,5 @@ class Proxy:
 
     @property
     def applications(self) -> int:
-        """Return the number of connected applications. Thread-safe."""
+        """The number of connected applications. Thread-safe."""
         return sum(session.role is not None for session in list(self._sessions.values()))

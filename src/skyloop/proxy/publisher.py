@@ -60,7 +60,7 @@ class VehiclePublisher:
 
     ``state_of`` returns the flight state, given the driver's state, because the software autopilot may know better.
     ``on_link_up`` is called on the driver's thread when the vehicle's link has come up. ``scrub`` removes the secrets
-    in the vehicle's address from a text.
+    in the vehicle's address from text.
     """
 
     def __init__(
@@ -122,6 +122,7 @@ class VehiclePublisher:
     def _finite(self, raw: Feedback) -> Feedback:
         """Return feedback with NaN and infinite numbers replaced by None, so that readers need not handle them."""
         vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
+        # NaN and infinity survive addition, so the usual case needs only one test.
         total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
         total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
         for vector in vectors:
@@ -140,7 +141,7 @@ class VehiclePublisher:
         self._owner = owner
         self._published_ns = -KEEP_ALIVE_NS
 
-    def tell(self, intent: Intent, app_id: int, name: str) -> None:
+    def set_outcome(self, intent: Intent, app_id: int, name: str) -> None:
         """Set the outcome of an intent in feedback. If the intent has ended, the next tick publishes the outcome."""
         self._newest = intent, app_id, name
         if intent.fate is not Fate.UNDER_WAY and (intent.fate, intent.reason) != self._shown_outcome:

@@ -30,7 +30,7 @@ from skyloop.proxy.core.flight import BELIEF_NS
 CLOSE_S: Final = 2.0  #: time to wait for each file when a proxy ends
 FOLDER: Final = "audit"
 SUFFIX: Final = ".jsonl"
-_MODE: Final = 0o600
+_MODE: Final = 0o600  # only the user may read the trail
 
 #: How long a note is valid. Supervisors restart a proxy within seconds, before another pilot takes over.
 LIFE_S: Final = seconds(BELIEF_NS)
@@ -145,7 +145,6 @@ def audit_folder() -> Path:
 
 
 def audit_path(name: str) -> Path:
-    """Return the file of a proxy."""
     return audit_folder() / (name + SUFFIX)
 
 
@@ -166,7 +165,6 @@ class AuditTrail:
         self._thread.start()
 
     def begin(self, uri: str) -> None:
-        """Record the start of the proxy's run."""
         self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:
@@ -200,16 +198,16 @@ class AuditTrail:
 
 
 def record_path(name: str) -> Path:
-    """Return a proxy's file. The file is next to the proxy's socket, where only the proxy's user may write."""
+    """Return the path of a proxy's note, next to its socket, where only the proxy's user may write."""
     from skyloop.transport.local.directory import find_directory
 
     return find_directory().path / (name + NOTE_SUFFIX)
 
 
 class FlightRecord:
-    """The file that holds one proxy's flight record. A separate thread writes it from :meth:`start` to :meth:`close`.
+    """The note about one proxy's flight, written by a separate thread from :meth:`start` to :meth:`close`.
 
-    ``vehicle``: the vehicle's address, because notes about other vehicles are ignored. ``wall``: the wall clock [s].
+    ``vehicle``: the vehicle's address; notes about other vehicles are ignored. ``wall``: the wall clock [s].
     """
 
     def __init__(self, path: Path, vehicle: str, wall: Callable[[], float] = time.time) -> None:

@@ -265,7 +265,6 @@ class WorkerRoster:
         self._workers: dict[_Key, Worker] = {}
 
     def find(self, app_id: int, processor: str) -> Worker | None:
-        """Return the application's worker for that processor; None if the application does not work for it."""
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
@@ -277,7 +276,6 @@ class WorkerRoster:
         return [self._workers.pop(key).asked for key in keys]
 
     def joined(self, app_id: int) -> int:
-        """Return the number of processors that the application works for."""
         return sum(app == app_id for app, _ in self._workers)
 
     def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:

@@ -98,7 +98,7 @@ class Answers:
         return repeated, full
 
     def end(self, number: int, answer: bytes | None) -> None:
-        """Mark a request as answered; ``answer`` is stored for repeats. If it is None, the request may be repeated."""
+        """Mark a request as answered. ``answer`` is stored for repeats; if it is None, repeats are executed again."""
         self._pending.discard(number)
         if answer is None:
             return

@@ -27,14 +27,14 @@ from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: maximum time that a proxy waits for its vehicle to land after a signal
 ORPHAN_LANDS_WITHIN_S: Final = 180.0  #: time that a private proxy waits for the landing after its program has gone
-_POLL_S: Final = 0.2
+_POLL_S: Final = 0.2  # interval at which signals, key updates and the vehicle link are checked
 GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this time; a waiting message is printed only later
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 K = TypeVar("K")
 
 #: Returns updates about the network's keys, one sentence each.
-Look = Callable[[], Sequence[str]]
+Poll = Callable[[], Sequence[str]]
 #: Runs an additional service, such as an endpoint for metrics, alongside the proxies of a process.
 Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
@@ -95,20 +95,20 @@ def serve(
     make_end: Callable[[str, str], TransportServer] | None = None,
     parent_fd: int | None = None,
     land_within_s: float = LAND_WITHIN_S,
-    look: Look | None = None,
+    poll: Poll | None = None,
     audit: Path | None = None,
     beside: Beside | None = None,
 ) -> None:
     """Serve a vehicle to this host's applications under a name. Blocks, and must be called on the main thread.
 
-    ``make_end`` creates another transport server for the name and the vehicle's address, for example for the network.
+    ``make_end`` creates the transport server, given the name and the vehicle's address; by default, for this host only.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
     Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
     with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s].
     A second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
-    which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``look`` is
-    called several times a second. The updates about keys that it returns are logged and published as an event.
+    which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``poll`` is
+    called several times a second. The updates about keys that it returns are logged and published as events.
 
     Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
@@ -116,14 +116,17 @@ def serve(
     from skyloop.transport.local import LocalServer
 
     if parent_fd is not None:
-        _check_descriptor(parent_fd)
+        try:
+            os.fstat(parent_fd)
+        except OSError:
+            raise UsageError(f"file descriptor {parent_fd} is not open: give the reading end of a pipe") from None
     driver = make_driver(uri)
     end = LocalServer(name, group=group) if make_end is None else make_end(name, str(driver.uri))
     run(
         [Proxy(driver, end, name=name)],
         parent_fd=parent_fd,
         land_within_s=land_within_s,
-        look=look,
+        poll=poll,
         audit=audit,
         beside=beside,
     )
@@ -134,7 +137,7 @@ def run(
     *,
     parent_fd: int | None = None,
     land_within_s: float = LAND_WITHIN_S,
-    look: Look | None = None,
+    poll: Poll | None = None,
     audit: Path | None = None,
     records: bool | None = None,
     beside: Beside | None = None,
@@ -176,13 +179,16 @@ def run(
         lines = [_announced(proxy) for proxy in proxies]
         # Wake up periodically, because a signal delivered to another thread does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
-            for change in look() if look is not None else ():
+            for change in poll() if poll is not None else ():
                 _log.warning("%s", change)
                 for proxy in proxies:
                     proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
             if parent_fd is None:  # a parent process gets the proxy's events, and may not read this output
                 for proxy, link in zip(proxies, lines, strict=True):
-                    _announce_link(proxy, link)
+                    vehicle = proxy.publisher
+                    state, reason, remedy = vehicle.link_state, vehicle.link_reason, vehicle.link_remedy
+                    if line := link.changed(state, reason, remedy, monotonic_ns()):
+                        announce(line)
 
 
 def keep_trail(proxy: Proxy, path: Path | None) -> None:
@@ -212,7 +218,7 @@ def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Ca
 
         at_once(
             {proxy: partial(end, proxy) for proxy in proxies},
-            tell=lambda proxy: within_s > 0.0 and proxy.handler.order_landing(proxy.clock()),
+            prepare=lambda proxy: within_s > 0.0 and proxy.handler.order_landing(proxy.clock()),
         )
     if raised:
         raise raised[0]
@@ -221,13 +227,13 @@ def end_all(proxies: Sequence[Proxy], within_s: float, *, reason: str, hurry: Ca
 def at_once(
     ends: Mapping[K, Callable[[], object]],
     *,
-    tell: Callable[[K], object],
+    prepare: Callable[[K], object],
     over: Callable[[K], bool] = lambda _: False,
     daemon: bool = False,
 ) -> None:
     """End several flights at the same time, each in its own thread, and wait for all. The ``ends`` must not raise.
 
-    ``tell``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
+    ``prepare``: called with the key of each end that gets no thread, before these ends run one after another. ``over``:
     returns whether to stop waiting for the end with this key. ``daemon``: whether the program may exit before they end.
     """
     threads: dict[K, threading.Thread] = {}
@@ -239,9 +245,9 @@ def at_once(
     left = [one for one in ends if one not in threads]
     for one in left:
         try:
-            tell(one)
+            prepare(one)
         except Exception:  # noqa: BLE001 the ends are called regardless
-            _log.exception("could not report that several flights end one after another")
+            _log.exception("the end of a flight, which has to wait for others, could not be prepared")
     for one in left:
         ends[one]()
     for one, thread in threads.items():
@@ -267,26 +273,13 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _check_descriptor(descriptor: int) -> None:
-    try:
-        os.fstat(descriptor)
-    except OSError:
-        raise UsageError(f"file descriptor {descriptor} is not open: give the reading end of a pipe") from None
-
-
 def _announced(proxy: Proxy) -> LinkLines:
     where = f"{proxy.driver.uri} at {proxy.server.address}, process {os.getpid()}"
     lines = LinkLines(proxy.name, where, monotonic_ns())
-    _announce(lines.first(proxy.publisher.link_state))
+    announce(lines.first(proxy.publisher.link_state))
     return lines
 
 
-def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
-    vehicle = proxy.publisher
-    if line := lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns()):
-        _announce(line)
-
-
-def _announce(line: str) -> None:
+def announce(line: str) -> None:
     with suppress(OSError):  # no one reads standard output: continue serving
         print(line, flush=True)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import msgspec
@@ -24,7 +23,7 @@ from skyloop.messages.frame import H264, MAX_ENCODED, split, why_not_decoded
 from skyloop.messages.subscription import MAX_KBIT_S, RateLimiter
 from skyloop.proxy.core.stream_rate import StreamRate, picture_form
 from skyloop.proxy.events import Counters
-from skyloop.proxy.topics import Forms
+from skyloop.proxy.topics import Variants
 from skyloop.pyav import H264Encoder, require_pyav
 from skyloop.transport.base import TransportServer
 from skyloop.transport.frame_encoding import resized_header
@@ -40,18 +39,15 @@ _BETTER_NS: Final = nanoseconds(3.0)  # wait before enlarging the image, because
 #: Fractions of the path's rate up to which forwarding the vehicle's own stream may start, and may continue.
 _BEGIN_SHARE: Final = 0.9
 _KEEP_SHARE: Final = 1.25
-#: If they overload the path, they are retried after this time. The time doubles with each failure.
+#: If forwarding overloads the path, it is retried after this time. The time doubles with each failure, up to a maximum.
 _TRY_AGAIN_NS: Final = nanoseconds(5.0)
 _TRY_AT_MOST_NS: Final = nanoseconds(80.0)
 _OWN_KBIT_S: Final = 12_000  # highest rate tried for the vehicle's own stream [kbit/s]
-_MEASURE_NS: Final = nanoseconds(1.0)
+_MEASURE_NS: Final = nanoseconds(1.0)  # time over which the rate of the vehicle's own stream is averaged
 _OWN_SILENT_NS: Final = nanoseconds(1.0)  # if no frame arrives for this long, the vehicle has stopped sending
 
 
-@dataclass(frozen=True, slots=True)
-class _Picture:
-    header: FrameHeader
-    pixels: NDArray[np.uint8]
+_Picture = tuple[FrameHeader, NDArray[np.uint8]]
 
 
 class StreamForm:
@@ -142,7 +138,7 @@ class StreamForm:
             if self._ended:
                 return
             self.skipped += self._newest is not None
-            self._newest = _Picture(header, pixels)
+            self._newest = header, pixels
             if self._thread is None:
                 name = f"skyloop-h264-{self.request.camera}"
                 self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -221,8 +217,9 @@ class StreamForm:
             return picture
 
     def _encode(self, picture: _Picture) -> None:
-        kbit_s = self._follow_path(picture.header)
-        header = resized_header(picture.header, *_even(picture.header, self._scale))
+        original, pixels = picture
+        kbit_s = self._follow_path(original)
+        header = resized_header(original, *_even(original, self._scale))
         with self._changed:
             encoder = None if self._needs_encoder else self._encoder
             self._needs_encoder = False
@@ -235,7 +232,7 @@ class StreamForm:
         now_ns = self._clock()
         with self._changed:
             key = self._wants_key and now_ns - self._key_ns >= KEY_NS
-        data, is_key = encoder.encode(*_image(picture), header.captured_ns, key=key)
+        data, is_key = encoder.encode(*_image(original, pixels), header.captured_ns, key=key)
         if not data:
             return
         if len(data) > MAX_ENCODED:
@@ -275,7 +272,7 @@ class StreamForm:
         return kbit_s
 
 
-class Streams(Forms[StreamForm]):
+class Streams(Variants[StreamForm]):
     """All encoded streams of a vehicle's cameras."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
@@ -368,9 +365,8 @@ def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
     return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
 
 
-def _image(picture: _Picture) -> tuple[NDArray[np.uint8], str]:
+def _image(header: FrameHeader, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], str]:
     """Return a frame's image and FFmpeg's name for its format."""
-    header, pixels = picture.header, picture.pixels
     channels = _CHANNELS.get(header.encoding)
     if channels is not None:
         shape = (header.height, header.width, 3) if channels == 3 else (header.height, header.width)

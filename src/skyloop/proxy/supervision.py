@@ -63,7 +63,7 @@ from skyloop.transport.base import COMMANDS, TransportServer
 
 _LAND: Final = Land()
 _NOTICED_M_S: Final = 0.05  #: software autopilot set-points that are reduced by less than this are not reported
-#: Minimum additional sleep time of the computer that is handled. A shorter sleep can't be distinguished from a delay.
+#: A sleep of the computer that is shorter than this is ignored: it can't be distinguished from a delay.
 SLEEP_NS: Final = nanoseconds(0.25)
 
 
@@ -126,7 +126,7 @@ class FlightSupervisor:
         self._stamp()
 
     def begin(self, now_ns: int) -> None:
-        """Start the run, before the server starts. A flight from an earlier run waits until its pilot returns."""
+        """Start the run, before the server starts. Silence counts from now on, so that an earlier pilot can return."""
         self.authority.last_command_ns = now_ns
 
     def tick(self, now_ns: int) -> None:
@@ -326,10 +326,9 @@ class FlightSupervisor:
 
     def _report_intent(self, session: Session) -> None:
         """Publish the outcome of an application's newest intent in feedback, promptly if it has ended."""
-        self._publisher.tell(session.intents.newest, session.app_id, session.name)
+        self._publisher.set_outcome(session.intents.newest, session.app_id, session.name)
 
     def _echo_own(self, action: AnyAction, now_ns: int) -> None:
-        """Publish the echo of one of the proxy's own actions."""
         if self._subscribers(COMMANDS):
             echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
             self._publish(COMMANDS, encode(echo))
@@ -375,9 +374,9 @@ class FlightSupervisor:
                 self._withdraw_takeoff(now_ns)
         drafts = self._act(now_ns, stamps=True)  # hover before the changes are published
         holder = self.authority.holder
-        told = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
-        ended = [draft for one, draft in told if isinstance(one, Lost | Preempted)]
-        rest = [draft for one, draft in told if not isinstance(one, Lost | Preempted)]
+        changes = [(one, authority_event(one, self._sessions, holder, now_ns)) for one in effects]
+        ended = [draft for one, draft in changes if isinstance(one, Lost | Preempted)]
+        rest = [draft for one, draft in changes if not isinstance(one, Lost | Preempted)]
         self._events.publish_drafts(*news, *ended, *drafts, *rest)
 
     def _stamp(self) -> None:

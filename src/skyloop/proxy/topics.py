@@ -32,14 +32,14 @@ from skyloop.transport.base import (
 )
 
 #: The topics whose names never change.
-PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
+FIXED_TOPICS: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 STREAM_TOPIC: Final = stream("")  #: prefix of stream topics
-PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topic of each variant of feedback
+PREFIX: Final = f"{FEEDBACK}?"  #: prefix of the topics of feedback variants
 _VIDEO_TOPIC: Final = video("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
 
 MAX_VARIANTS: Final = 16  #: maximum number of simultaneous feedback variants, each with any number of subscribers
-#: How long a requested variant keeps its place without subscribers, because a subscription may be in transit.
+#: How long a requested variant is kept without subscribers, in case a subscription is still in transit.
 KEEP_NS: Final = nanoseconds(5.0)
 PERIOD_NS: Final = nanoseconds(1.0)  #: interval between two overviews
 _FRESH_NS: Final = PERIOD_NS // 2  # if an overview is younger than this, it is sent again instead of a new one
@@ -51,7 +51,7 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
 
     A processor's results may be subscribed to before it has a worker.
     """
-    if topic in PLAIN:
+    if topic in FIXED_TOPICS:
         return ""
     if topic.startswith(_RESULTS_TOPIC):
         name = topic.removeprefix(_RESULTS_TOPIC)
@@ -62,7 +62,8 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
             return camera_problem(VideoRequest.parse(topic).camera, cameras)
         except UsageError as error:
             return str(error)
-    return UnknownNameError("topic", topic[:64], {*PLAIN, *map(video, cameras()), *map(stream, cameras())}).message
+    available = {*FIXED_TOPICS, *map(video, cameras()), *map(stream, cameras())}
+    return UnknownNameError("topic", topic[:64], available).message
 
 
 def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
@@ -74,48 +75,46 @@ def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
 # Variants of samples, and feedback at reduced rates -------------------------------------------------------------------
 
 
-class Form(Protocol):
+class Variant(Protocol):
     """A variant of samples that is published on one topic."""
 
     topic: str
     asked_ns: int  #: time of the newest request for this variant
 
 
-F = TypeVar("F", bound=Form)
+V = TypeVar("V", bound=Variant)
 
 
-class Forms(Generic[F]):
+class Variants(Generic[V]):
     """A limited number of variants that have subscribers or may soon have some. Thread-safe."""
 
     def __init__(self, most: int, subscribers: Callable[[str], int], clock: Clock) -> None:
-        self.known: tuple[F, ...] = ()
+        self.known: tuple[V, ...] = ()
         self._most = most
         self._subscribers = subscribers
         self._clock = clock
         self._lock = threading.Lock()  # guards changes to the set of known variants
 
-    def find(self, topic: str) -> F | None:
+    def find(self, topic: str) -> V | None:
         """Return the variant of a topic; None if no one has requested it."""
-        return next((form for form in self.known if form.topic == topic), None)
+        return next((variant for variant in self.known if variant.topic == topic), None)
 
-    def claim(self, topic: str, make: Callable[[], F]) -> bool:
+    def claim(self, topic: str, make: Callable[[], V]) -> bool:
         """Reserve a place for a variant, or renew the reservation. Return False if all places are taken."""
         now_ns = self._clock()
         with self._lock:
-            form = self.find(topic)
-            if form is None:
+            variant = self.find(topic)
+            if variant is None:
                 kept = [one for one in self.known if now_ns - one.asked_ns < KEEP_NS or self._subscribers(one.topic)]
                 if len(kept) >= self._most:
                     return False
-                form = make()
-                self.known = (*kept, form)
-            form.asked_ns = now_ns
+                variant = make()
+                self.known = (*kept, variant)
+            variant.asked_ns = now_ns
         return True
 
 
-class _Variant:
-    """One variant of feedback."""
-
+class _FeedbackVariant:
     def __init__(self, topic: str, request: FeedbackRequest) -> None:
         self.topic = topic
         self.rate = RateLimiter(request.max_hz)
@@ -123,7 +122,7 @@ class _Variant:
         self.last_seq = 0
 
 
-class FeedbackVariants(Forms[_Variant]):
+class FeedbackVariants(Variants[_FeedbackVariant]):
     """The variants of feedback that have subscribers or may soon have some."""
 
     def __init__(self, server: TransportServer, counters: Counters, clock: Clock) -> None:
@@ -137,7 +136,7 @@ class FeedbackVariants(Forms[_Variant]):
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
             return str(error)
-        if self.claim(topic, lambda: _Variant(topic, request)):
+        if self.claim(topic, lambda: _FeedbackVariant(topic, request)):
             return ""
         return (
             f"this proxy sends feedback in at most {MAX_VARIANTS} variants at a time, and all are in use: "
@@ -191,7 +190,7 @@ class OverviewRegistry:
             self._made_ns = None
 
     def packets(self, now_ns: int) -> list[bytes]:
-        """Return the current overview, encoded as as many packets as needed."""
+        """Return the current overview, split into as many packets as needed."""
         with self._lock:
             if self._made_ns is None or not 0 <= now_ns - self._made_ns < _FRESH_NS:
                 rows = sorted((row() for row in self._sources), key=lambda row: row.name)

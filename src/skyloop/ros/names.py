@@ -50,10 +50,7 @@ class Frames:
 
 
 def namespaces_of(drones: tuple[str, ...]) -> dict[str, str]:
-    """Return each drone's namespace, without a slash.
-
-    Raise ``UsageError`` if two drones would have the same namespace.
-    """
+    """Return each drone's namespace, without a slash."""
     found: dict[str, str] = {}
     for name in drones:
         namespace = ros_name(name)

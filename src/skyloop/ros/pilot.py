@@ -21,14 +21,10 @@ WARN_AGAIN_S: Final = 5.0  #: interval between warnings of the same kind
 class Pilot:
     """Converts messages on topics and service calls to commands. Commands require control authority.
 
-    Args:
-        topics: The rclpy node in the drone's namespace whose callbacks never wait.
-        services: The node whose callbacks may block, several at a time.
-        drone: The drone, connected as a pilot, with the time limit after which a velocity becomes a hover.
-        time: The source of the stamps.
-        frames: Names of the drone's frames.
-        priority: Priority for requesting authority, 0 (highest) to 31; None uses the default.
-        timeout_s: Maximum age of a stamped velocity [s].
+    ``topics`` is the rclpy node in the drone's namespace whose callbacks never wait; the callbacks of ``services`` may
+    block, several at a time. ``drone`` is connected as a pilot, with the time limit after which a velocity becomes a
+    hover. ``priority``: for requesting authority, 0 (highest) to 31; None uses the default. ``timeout_s``: maximum age
+    of a stamped velocity [s].
     """
 
     def __init__(

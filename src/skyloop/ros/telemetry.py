@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from array import array
+from collections.abc import Callable
 from typing import Any, Final
 
 from skyloop.client import Drone, Frame
@@ -28,7 +29,7 @@ from skyloop.vehicles.ros2.wire import (
 
 SLOW_NS: Final = 1_000_000_000  #: interval between battery messages, and between geographic positions
 _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
-JPEG_QUALITY: Final = 90
+JPEG_QUALITY: Final = 90  #: on OpenCV's scale, 0 to 100
 
 
 class Telemetry:
@@ -58,7 +59,7 @@ class Telemetry:
             self._open_transforms(drone.capabilities.cameras)
         except UnsupportedError as error:
             node.get_logger().warning(f"no /tf and no /tf_static: {error}")
-        self._told: dict[Any, str] = {}
+        self._last_text: dict[Any, str] = {}
         self._slow_ns = 0
         drone.on_feedback(self.publish)
 
@@ -70,29 +71,17 @@ class Telemetry:
         if stamp_ns is None or feedback.vehicle_link not in (LinkState.UP, LinkState.DEGRADED):
             return
         rotation = _quaternion(feedback)
-        for publisher, make in (
-            (self._odometry, self._odometry_of),
-            (self._velocity, self._velocity_of),
-            (self._imu, self._imu_of),
-        ):
-            if publisher.get_subscription_count():
-                message = make(feedback, rotation, stamp_ns)
-                if message is not None:
-                    publisher.publish(message)
+        _publish(self._odometry, self._odometry_of, feedback, rotation, stamp_ns)
+        _publish(self._velocity, self._velocity_of, feedback, rotation, stamp_ns)
+        _publish(self._imu, self._imu_of, feedback, rotation, stamp_ns)
         if rotation is not None and feedback.position_m is not None and self._transforms is not None:
             frames = self._frames
             moved = Transform(stamp_ns, frames.odom, frames.base, feedback.position_m, rotation)
             self._transforms.publish(encode_transforms([moved]))
         if feedback.captured_ns - self._slow_ns >= SLOW_NS:
             self._slow_ns = feedback.captured_ns
-            self._publish_slow(feedback, stamp_ns)
-
-    def _publish_slow(self, feedback: Feedback, stamp_ns: int) -> None:
-        for publisher, make in ((self._battery, self._battery_of), (self._fix, self._fix_of)):
-            if publisher.get_subscription_count():
-                message = make(feedback, stamp_ns)
-                if message is not None:
-                    publisher.publish(message)
+            _publish(self._battery, self._battery_of, feedback, stamp_ns)
+            _publish(self._fix, self._fix_of, feedback, stamp_ns)
 
     def _open_transforms(self, cameras: tuple[CameraInfo, ...]) -> None:
         from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -122,11 +111,11 @@ class Telemetry:
             self._static.publish(encode_transforms(known))
 
     def _publish_text(self, publisher: Any, text: str) -> None:
-        """Publish a text if it differs from the last one."""
-        if self._told.get(publisher) != text:
+        """Publish text if it differs from the last one."""
+        if self._last_text.get(publisher) != text:
             from std_msgs.msg import String
 
-            self._told[publisher] = text
+            self._last_text[publisher] = text
             publisher.publish(String(data=text))
 
     # Messages ------------------------------------------------------------------------------------------------------
@@ -223,6 +212,12 @@ class Telemetry:
         message.header.stamp.sec, message.header.stamp.nanosec = stamp_of(stamp_ns)
 
 
+def _publish(publisher: Any, make: Callable[..., Any], *given: Any) -> None:
+    """Make and publish a message if the topic has subscribers, unless the data is missing."""
+    if publisher.get_subscription_count() and (message := make(*given)) is not None:
+        publisher.publish(message)
+
+
 def _quaternion(feedback: Feedback) -> Quaternion | None:
     if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None
@@ -266,7 +261,6 @@ class CameraPublisher:
 
     @property
     def watched(self) -> bool:
-        """Whether any of the topics has a subscriber."""
         publishers = (self._image, self._info, self._compressed)
         return any(each is not None and each.get_subscription_count() for each in publishers)
 

@@ -67,7 +67,7 @@ def _sign_away(folder: Path) -> None:
         (lambda mine, _: (mine / "identity.key").unlink(), UsageError, "the private key .* can't be read"),
         (lambda mine, _: (mine / "identity.key").chmod(0o644), UsageError, "open to others .mode 0644.*chmod 600"),
         (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "not an unencrypted private key"),
-        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "not a key as made by"),
+        (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "not a key made by"),
         (
             lambda mine, other: shutil.copy(other / "identity.key", mine),
             UsageError,
@@ -188,7 +188,7 @@ def test_expiries_of_a_key_and_its_authority_are_announced(tmp_path: Path) -> No
 
 def test_a_directory_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match="can't be made"):
+    with pytest.raises(UsageError, match="can't be created"):
         make_directory(tmp_path / "file" / "keys")
 
 

@@ -25,7 +25,7 @@ NAMES = st.from_regex(NAME, fullmatch=True)
         ("jane/x", "pilot", "*", "cannot be the name of a key"),
         ("j*", "pilot", "*", "cannot be the name of a key"),
         ("a" * 49, "pilot", "*", "1 to 48"),
-        ("anyone", "pilot", "*", "who have no key"),
+        ("anyone", "pilot", "*", "without a key"),
         ("jane", "captain", "*", "pilot, observer, proxy, router"),
         ("jane", "pilot", "", "names no drones"),
         ("jane", "pilot", "alpha,", "names no drones"),

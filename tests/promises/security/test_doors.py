@@ -259,7 +259,7 @@ def test_a_client_revoked_in_flight_loses_the_drone_and_does_not_come_back(tmp_p
 
 
 def test_our_ends_refuse_keys_of_another_role_or_name(rig: Rig, lab: Lab) -> None:
-    with pytest.raises(UsageError, match="a proxy needs keys of --role proxy"):
+    with pytest.raises(UsageError, match="a proxy needs keys created with --role proxy"):
         FabricServer(DRONE, rig.settings("jane"))
     with pytest.raises(UsageError, match="not for the name 'alpha'"):
         FabricServer(DRONE, rig.settings("bravo"))

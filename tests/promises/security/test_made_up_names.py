@@ -25,7 +25,7 @@ from skyloop.messages import (
 from skyloop.messages.relayed import pack
 from skyloop.network.frames import MAX_FORMS, MAX_FORMS_EACH, FramePublisher
 from skyloop.proxy.requests import MAX_MALFORMED
-from skyloop.proxy.topics import PLAIN, topic_problem
+from skyloop.proxy.topics import FIXED_TOPICS, topic_problem
 from skyloop.transport.base import ANNOTATIONS, MAX_SUBSCRIPTIONS, RESULTS
 from skyloop.transport.testing import header, picture, wait_until
 from tests.support.proxy_bench import WAIT_S, App, Bench
@@ -41,7 +41,13 @@ def bench() -> Iterator[Bench]:
 
 @pytest.mark.parametrize(
     "topic",
-    [*sorted(PLAIN), "results/detector-1.b", "video/front", "stream/bottom", "video/front?encoding=jpeg&quality=80"],
+    [
+        *sorted(FIXED_TOPICS),
+        "results/detector-1.b",
+        "video/front",
+        "stream/bottom",
+        "video/front?encoding=jpeg&quality=80",
+    ],
 )
 def test_existing_topics_can_be_subscribed_to(topic: str) -> None:
     assert topic_problem(topic, lambda: CAMERAS) == ""

@@ -28,13 +28,13 @@ from skyloop.network.keys.credentials import Credentials, Roster
 from skyloop.network.keys.identity import Identity
 
 AGAIN: Final = timedelta(hours=1)  #: interval between warnings about an approaching expiry
-SECRET_BYTES: Final = 32
+SECRET_BYTES: Final = 32  #: size of a key of ChaCha20-Poly1305
 _PURPOSE: Final = "fabric connection 1"  # prefix of all content that is signed here; no other signature uses it
 _OFFER, _ANSWER = "offer", "answer"
 
 
 class KeyRing:
-    """Reads the key folder periodically. All methods are thread-safe."""
+    """A process's keys, and the newest roster in their folder. Thread-safe."""
 
     def __init__(self, credentials: Credentials) -> None:
         self.credentials = credentials
@@ -108,7 +108,7 @@ class KeyRing:
 def _stamp(credentials: Credentials) -> tuple[int, int, int]:
     """Return values that change whenever the roster's file changes."""
     try:
-        found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and called every second
+        found = os.stat(credentials.roster_file)  # noqa: PTH116  cheaper, and called twice a second
     except OSError:
         return 0, 0, 0
     return found.st_mtime_ns, found.st_size, found.st_ino
@@ -140,7 +140,6 @@ class Agreement:
         self._terms = terms
         self._private = X25519PrivateKey.generate()
         self._offered = b""
-
         self._share = self._private.public_key().public_bytes_raw()
 
     def offer(self) -> bytes:

@@ -184,7 +184,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
     except (ValueError, TypeError):  # an encrypted key raises TypeError
         raise FileFormatError(f"{path} is not an unencrypted private key in PEM form, or is damaged") from None
     if not isinstance(key, PrivateKey):
-        raise FileFormatError(f"{path} is not a key as made by skyloop keys: it must be on an elliptic curve")
+        raise FileFormatError(f"{path} is not a key made by skyloop keys: it must be on an elliptic curve")
     return key
 
 
@@ -195,7 +195,7 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
     except x509.ExtensionNotFound:
         constraints = x509.BasicConstraints(ca=False, path_length=None)
     if not constraints.ca or not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
-        raise FileFormatError(f"{path} is not the certificate of an authority that skyloop keys init made")
+        raise FileFormatError(f"{path} is not the certificate of an authority created by Skyloop")
     if key is not None and not matches(key, certificate):
         raise UsageError(f"the key of the authority does not belong to its certificate {path}")
     return Authority(certificate, key)
@@ -249,12 +249,6 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
         return x509.DNSName(name.lower())
 
 
-def _public(certificate: x509.Certificate) -> ec.EllipticCurvePublicKey:
-    public = certificate.public_key()
-    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
-    return public
-
-
 def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> Authority:
     key, name = new_key(), _name(title)
     builder = _builder(name, name, key, now, now + timedelta(days=days), authority=True)
@@ -274,10 +268,12 @@ def _issued(
 ) -> x509.Certificate:
     assert authority.key is not None
     issuer = authority.certificate
+    public = issuer.public_key()
+    assert isinstance(public, ec.EllipticCurvePublicKey)  # read_authority has checked this
     return (
         _builder(_name(title), issuer.subject, key, now, min(until, issuer.not_valid_after_utc), authority=False)
         .add_extension(x509.ExtendedKeyUsage(purposes), critical=True)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(_public(issuer)), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(public), critical=False)
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .sign(authority.key, hashes.SHA256())
     )

@@ -1,4 +1,4 @@
-"""Load and check an identity's folder for a program and watch it for a newer roster; encode and decode rosters.
+"""Load and check an identity's folder, read newer rosters from it, and encode and decode rosters.
 
 ================  ==============================================================================
 ``ca.pem``        the certificate of the lab's authority
@@ -35,7 +35,7 @@ from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 from skyloop.platform import is_open_to_others, lock_file
 
-FORMAT: Final = 1
+FORMAT: Final = 1  #: version of the roster's format
 _PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
 AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
@@ -80,7 +80,6 @@ class Roster(msgspec.Struct, frozen=True):
     format: int = FORMAT
 
     def find(self, name: str) -> Entry | None:
-        """Return the entry for a name, or None if there is none."""
         return next((entry for entry in self.entries if entry.name == name), None)
 
     @property
@@ -259,7 +258,7 @@ def make_directory(path: Path) -> None:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = path.stat().st_mode
     except OSError as error:
-        raise UsageError(f"{path} can't be made: {error.strerror}") from None
+        raise UsageError(f"{path} can't be created: {error.strerror}") from None
     if is_open_to_others(mode):
         raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
 

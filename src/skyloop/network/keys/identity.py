@@ -23,7 +23,7 @@ from skyloop.errors import UsageError
 from skyloop.network import layout
 
 ALL_DRONES: Final = ("*",)
-MAX_PATTERNS: Final = 32
+MAX_PATTERNS: Final = 32  #: maximum number of an identity's patterns, each of which adds keys to every node's rules
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 _PATTERN: Final = re.compile(r"[a-z0-9_.*-]{1,48}")
 INGRESS: Final = "ingress"
@@ -77,13 +77,13 @@ class Identity:
     def require_proxy(self, drone: str) -> None:
         """Check that this is a proxy that may serve a drone with this name."""
         if self.role is not KeyRole.PROXY:
-            raise UsageError(f"these are the keys of {self}: a proxy needs keys of --role proxy")
+            raise UsageError(f"these are the keys of {self}: a proxy needs keys created with --role proxy")
         if not self.covers(drone):
             raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
 
     def require_router(self) -> None:
         if self.role is not KeyRole.ROUTER:
-            raise UsageError(f"these are the keys of {self}: a router needs keys of --role router")
+            raise UsageError(f"these are the keys of {self}: a router needs keys created with --role router")
 
     def require_application(self) -> None:
         if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
@@ -105,9 +105,9 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
             "the first one a letter or a digit"
         )
     if name == layout.ANYONE:
-        raise UsageError(f"no key can be named {layout.ANYONE!r}: that is the name of all who have no key")
+        raise UsageError(f"no key can be named {layout.ANYONE!r}: that name stands for everyone without a key")
     if role not in list(KeyRole):
-        raise UsageError(f"there is no role {role!r}; there are {', '.join(KeyRole)}")
+        raise UsageError(f"there is no role {role!r}: choose one of {', '.join(KeyRole)}")
     patterns = parse_drones(drones)
     if role == KeyRole.ROUTER and patterns != ALL_DRONES:
         raise UsageError("a router carries the traffic of all drones: leave out the drones")

@@ -8,8 +8,9 @@
 ================  ========================================================================
 
 Pages need certificates because browsers decode video, and keep the screen on, only over https. These are issued by a
-separate authority, in a folder next to the lab's key folder. Users make their browsers trust it. This is safe because
-the authority can't certify anything beyond private networks. The two keys can't replace each other.
+separate authority, in the folder ``pages`` inside the user's folder of keys. Users make their browsers trust it. This
+is safe because the authority can't certify anything beyond private networks. Neither authority's key can stand in for
+the other's.
 
 ============  ==========================================================================
 ``ca.pem``    the certificate for browsers to trust
@@ -53,11 +54,9 @@ from skyloop.network.keys.identity import Identity
 
 AUTHORITY_DAYS: Final = 1825  #: default validity of a lab's authority
 IDENTITY_DAYS: Final = 30.0  #: default validity period of an identity
-MAX_IDENTITY_DAYS: Final = 366.0
+MAX_IDENTITY_DAYS: Final = 366.0  #: maximum validity period of an identity
 _AUTHORITY_KEY: Final = "ca.key"
 _ISSUED: Final = "issued"
-FOLDER: Final = "pages"  #: name of the folder for pages, inside the lab's folder
-
 PAGE_DAYS: Final = 366  #: browsers reject certificates that are valid for much longer
 RENEWED_DAYS: Final = 60  #: when the cockpit starts, it replaces a certificate that is valid for fewer days than this
 
@@ -107,7 +106,6 @@ class Lab:
         return decode_roster(read(path, "the roster"), self.authority, path)
 
     def folder(self, name: str) -> Path:
-        """Return the path of an identity's folder."""
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:

@@ -1,11 +1,11 @@
 """Decide where a vehicle may fly, and how fast: judge each set-point, position, hover, take-off and step. Pure.
 
 Every wall is a plane: those of the safety box and, for each no-fly zone, the plane through its nearest point that is
-perpendicular to the line of sight. The whole zone is behind that plane, because zones are convex. Inside a zone, the
-plane through which the vehicle entered is remembered, so that the vehicle is led back to the side that it came from. At
-distance ``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with the
-reaction time ``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its part parallel to the
-plane. An attitude passes unchanged until the vehicle reaches that speed. Then a braking attitude replaces it.
+perpendicular to the line from the vehicle to that point. Zones are convex, so the whole zone is behind that plane.
+Inside a zone, the plane through which the vehicle entered stays in force and leads it back to the side that it came
+from. At distance ``d`` from a plane, the vehicle may approach only as fast as it can stop: ``v·t + v²/(2·a) = d``, with
+the reaction time ``t`` (plus the age of the position) and the deceleration ``a``. A velocity keeps its part parallel to
+the plane. An attitude passes unchanged until the vehicle reaches that speed. Then a braking attitude replaces it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
 from skyloop.proxy.core.flight import STALE_NS
 from skyloop.zones import Space, Vec3, Wall, Zone
 
-GRAVITY_M_S2: Final = 9.80665
-LOST_NS: Final = 2 * NS_PER_S  #: if a position is older than this, the next one is not worth waiting for
+GRAVITY_M_S2: Final = 9.80665  #: standard gravity
+LOST_NS: Final = 2 * NS_PER_S  #: if the newest position is older than this, targets are refused instead of held back
 BLIND_M: Final = 0.5  #: maximum distance flown towards a target between walls without a new measured position
 #: A position counts as having jumped if it changes by more than this, and by more than the vehicle could have flown.
 JUMP_M: Final = 1.0
 MARGIN_M: Final = 0.1  #: distance beyond a wall that counts as noise; further out, the vehicle may only move back
 BRAKE_GAIN: Final = 2.0  #: requested deceleration for each unit of excess speed [1/s]
 RETURN_M_S: Final = 0.5  #: maximum speed for bringing back a vehicle whose set-point leads further past a wall
-#: A vehicle that hovers this far above ``limits.altitude`` [m] is lowered, at this speed [m/s] or faster.
-HOVER_SLACK_M: Final = 0.3
-SINK_M_S: Final = 0.2
+HOVER_SLACK_M: Final = 0.3  #: a vehicle that hovers further than this above ``limits.altitude`` is lowered
+SINK_M_S: Final = 0.2  #: minimum speed at which it is lowered
 TAKEOFF_M: Final = 1.0  #: minimum height assumed for a take-off
 LIFTED_M: Final = 0.3  #: a zone lower than this does not prevent a take-off: it may be the table that the vehicle is on
 
@@ -195,7 +194,7 @@ class Airspace:
         problem = "" if below[2] >= z else zones.problem_at(below) or zones.problem_between(at, below)
         return f"the vehicle would have to sink to {altitude:g} m, and {problem}" if problem else ""
 
-    def apart(self) -> Airspace:
+    def copy(self) -> Airspace:
         """Return a copy with the same observations, for checking hypothetical requests."""
         other = Airspace(self.settings)
         other._newest, other._at_ns, other._moves = self._newest, self._at_ns, self._moves
@@ -329,7 +328,7 @@ class Airspace:
             x, y, z = wall.normal
             most = self.allowed_speed(wall.distance, late_s)
             across = math.hypot(x, y)
-            if across > 0.3:
+            if across > 0.3:  # a wall that is nearly level limits only the climb rate, below
                 x, y = x / across, y / across
                 pull = x * east + y * north
                 outside = wall.distance < -MARGIN_M
@@ -433,7 +432,7 @@ class Airspace:
         return max(0.0, seconds(now_ns - min(self._at_ns, feedback.captured_ns)))
 
     def _young(self, feedback: Feedback, now_ns: int) -> bool:
-        """Return whether the newest position is fresh enough to fly to a target; between walls, speed matters."""
+        """Return whether the newest position is fresh enough to fly to a target; between walls, speed counts, too."""
         if now_ns - feedback.captured_ns > STALE_NS:
             return False
         speed = _speed(feedback)

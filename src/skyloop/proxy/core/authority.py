@@ -22,7 +22,7 @@ class QueueEntry:
     arrival: int  #: number of the application's first request since it was last neither holder nor waiting
     app_id: int
     term_ns: int | None = field(default=None, compare=False)  #: requested duration after the grant; None: unlimited
-    #: When the holder's time to answer the application's request is over; None if the holder was not asked.
+    #: When the holder's time to answer this request ends; None if the holder was not asked.
     asks_until_ns: int | None = field(default=None, compare=False)
 
     def asks(self, now_ns: int) -> bool:

@@ -54,7 +54,7 @@ LONGEST_RISE_S: Final = 2.0  #: ... plus this [s]
 # Return flight:
 NEAR_M: Final = 0.3  #: a vehicle that is this close and at rest has arrived
 CLOSE_M: Final = 1.0  #: a vehicle that is this close and gets no closer has arrived
-AT_REST_M_S: Final = 0.3
+AT_REST_M_S: Final = 0.3  #: maximum speed of a vehicle that counts as at rest
 HEADWAY_M: Final = 0.2  #: a leg has stalled if the remaining distance does not decrease by this …
 STALL_NS: Final = 10 * NS_PER_S  #: … within this time
 #: If a return is not possible, how long a failsafe waits for that to change before it lands the vehicle in place.
@@ -123,7 +123,7 @@ class Autopilot:
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
         self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
-        #: Returns the permitted velocity for a desired one, given the newest feedback. Not called during a landing.
+        #: Returns the permitted velocity for a desired one, given fresh feedback. Not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._takes_velocity = "velocity" in native
         self._target: Velocity | Position = Velocity()
@@ -186,6 +186,7 @@ class Autopilot:
             self.mode = Mode.OFF
         elif known is not None and self.mode is not Mode.LAND:
             wanted = self.guard(wanted, known, now_ns)
+        # Limited, so that one step after a pause does not fill the integral.
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
         self._stepped_ns = now_ns
         if self._takes_velocity:
@@ -399,7 +400,7 @@ class ReturnFlight:
         if self._action.problem:
             return ReturnDecision(None, (), Refusal.OUT_OF_RANGE, self._action.problem, True)
         if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return None  # this refusal does not depend on the target
+            return None  # the airspace refuses this, whatever the target
         if self.phase is not ReturnPhase.NONE:
             problem = self._go_on(feedback, feedback.position_m, now_ns)
             return ReturnDecision(None, (), Refusal.WRONG_STATE, problem, True) if problem else None
@@ -418,7 +419,7 @@ class ReturnFlight:
             if walls is not None:
                 top = min(top, max(walls.high[2] - CLEARANCE_M, walls.low[2]))
         above, over = (at[0], at[1], top), (start[0], start[1], top)
-        # Outside the box or inside a zone, the vehicle must not climb first, because the straight line leads back.
+        # Outside the box or inside a zone, the vehicle must not climb first: the straight line leads back.
         climbs = top - at[2] > NEAR_M and not space.problem_at(above)
         problem = space.problem_at(over) or space.problem_between(above if climbs else at, over)
         if not problem and climbs:

@@ -46,7 +46,7 @@ from skyloop.proxy.core.autopilot import ReturnDecision, ReturnFlight, ReturnSet
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.flight import Flight, Snapshot, Whose
 
-MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: maximum lead of a command's time, given errors in the clock offset
+MAX_AHEAD_NS: Final = nanoseconds(0.05)  #: how far in the future a command's time may be: the clock offset has errors
 TAKEOFF_NS: Final = nanoseconds(20.0)  #: a take-off that has not left the ground after this time is withdrawn
 #: A landing that withdrew a take-off is complete after this time on the ground, in case arming was in progress.
 SETTLED_NS: Final = nanoseconds(1.0)
@@ -338,7 +338,7 @@ class CommandChecks:
         return Decision(verdict.action, None, "", takes_off, verdict.clamps, verdict.enforced)
 
     def keeps_failsafe(self, kind: type[Action], seen: Snapshot, *, automatic: bool) -> bool:
-        """Return whether the ladder's task continues (or else ends) when the holder's command is executed."""
+        """Return whether the ladder's task continues, rather than ends, when the holder's command is executed."""
         ladder = self._ladder
         if automatic:
             return ladder.continues_landing or ladder.step is Failsafe.LAND
@@ -364,7 +364,7 @@ class CommandChecks:
     def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
         """Return why the vehicle can't start a return flight that ends in a landing now; empty if it can."""
         flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
-        decision = flight.step(self.airspace.apart(), feedback, now_ns)
+        decision = flight.step(self.airspace.copy(), feedback, now_ns)
         return decision.why if decision.action is None and decision.refusal is not None else ""
 
     def _problem(

@@ -1,7 +1,8 @@
 """The failsafe ladder. It decides when a flying vehicle without a pilot hovers and lands. Pure: time is an argument.
 
-Steps escalate automatically (none, hover, land). The steps end only with a fresh command or on the ground. The vehicle
-may first fly back to its start, if parameters require this and nothing prevents it. ``docs/proxy.md`` has the rules.
+Steps escalate automatically (none, hover, land). They end only with a fresh command, on the ground, or when others take
+the vehicle over. The vehicle may first fly back to its start, if parameters require this and nothing prevents it.
+``docs/proxy.md`` has the rules.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _LAND_AT_START: Final = ReturnToStart(land=True)
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.UNKNOWN}),
-    ReturnToStart: frozenset(),  # the whole return is steered
+    ReturnToStart: frozenset(),  # the proxy itself steers the return
 }
 
 
@@ -141,7 +142,7 @@ class FailsafeLadder:
         self._next_try_ns = 0
 
     def update(self, now_ns: int, inputs: FailsafeInputs) -> list[Effect]:
-        """Perform the steps that are due. Call at a steady pace, and immediately after relevant changes."""
+        """Return the effects that are due. Call at a steady pace, and immediately after relevant changes."""
         effects = self._battery(inputs)
         self.given_up &= inputs.airborne and not inputs.link_up
         if not inputs.airborne:
@@ -151,12 +152,12 @@ class FailsafeLadder:
             self._wanted = None
             return effects + self._move(Failsafe.NONE, "others")
         low = self.battery_low and not self._overruled
-        told = inputs  # the driver may not report yet that a pilot continues a landing
-        if isinstance(self._wanted, Land) or self.given_up:  # only a landing can follow
-            told = replace(inputs, state=FlightState.LANDING)
-        step, reason = due(now_ns, told, self.settings, barred=self.barred, battery_low=low)
+        assumed = inputs
+        if isinstance(self._wanted, Land) or self.given_up:  # the driver may not report the landing yet
+            assumed = replace(inputs, state=FlightState.LANDING)
+        step, reason = due(now_ns, assumed, self.settings, barred=self.barred, battery_low=low)
         if _RANK[step] > _RANK[self.step]:
-            returns = step is Failsafe.LAND and self._should_return(reason) and told.state is not FlightState.LANDING
+            returns = step is Failsafe.LAND and self._should_return(reason) and assumed.state is not FlightState.LANDING
             why = inputs.return_problem if returns else ""
             effects += self._begin(StepChange(step, reason, returns and not why, why), now_ns)
         elif self.returning and self.barred:
@@ -186,7 +187,7 @@ class FailsafeLadder:
 
     @property
     def lands_for_battery(self) -> bool:
-        """Whether it returns or lands because of a low battery. A pilot's decision ends this; a set-point doesn't."""
+        """Whether the vehicle returns or lands because its battery is low. A pilot can end this, not by a set-point."""
         return self.step is Failsafe.LAND and self.reason == "battery_return"
 
     def hand_over(self, now_ns: int) -> None:

@@ -36,8 +36,8 @@ BELIEF_NS: Final = nanoseconds(60.0)
 STALE_NS: Final = NS_PER_S // 2  #: age from which feedback is ignored
 AIRBORNE_ALTITUDE: Final = 0.3  #: a vehicle that reports no state counts as flying if first seen above this height [m]
 STALL_ALTITUDE: Final = 0.5  #: below this altitude, a descent without progress has reached the ground [m]
-STALL_NS: Final = NS_PER_S
-STALL_HEADWAY: Final = 0.02  #: minimum progress of a descent within that time [m]
+STALL_NS: Final = NS_PER_S  #: time without progress after which a descent has stalled
+STALL_HEADWAY: Final = 0.02  #: smallest decrease in altitude that counts as progress [m]
 BLIND_NS: Final = 15 * NS_PER_S  #: after this time, the result of a landing without sensor data is unknown
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -84,7 +84,7 @@ class Flight:
         self._has_no_notion = bool(native & {"attitude", "velocity"}) and not native & {"takeoff", "land"}
         self.whose = Whose.NOBODYS
         self.left_to = ""  #: what others made the vehicle do, as the driver reports it
-        self._believed_until_ns: int | None = None  # until then, a vehicle in the air is assumed to be on an old flight
+        self._believed_until_ns: int | None = None  # until then, a flight that is found counts as an earlier run's
         self._claimed_until_ns: int | None = None  # deadline for a requested take-off to have a visible effect
         self._grounded_ns: int | None = None  # start of the current period of time on the ground
         self._steered = False  # whether the vehicle is steered in software, with the task in :attr:`_state`
@@ -167,7 +167,7 @@ class Flight:
         self.whose, self.left_to = Whose.OURS, ""
 
     def forget(self) -> bool:
-        """Assume from now on that a vehicle found in the air may be on another flight; return whether it may be."""
+        """Assume from now on that the vehicle may be on someone else's flight; return whether others can fly it."""
         if self.ours and self._shared:
             self.whose = Whose.NOBODYS
         return self._shared

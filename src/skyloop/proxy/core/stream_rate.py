@@ -18,7 +18,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
 
-LEAST_KBIT_S: Final = 60
+LEAST_KBIT_S: Final = 60  #: the minimum rate
 #: The initial rate. Isolated late frames do not reduce the rate below it: the path is idle for most of the wait, so a
 #: lower rate would hardly help.
 START_KBIT_S: Final = 300
@@ -34,7 +34,7 @@ SEARCH_1_S: Final = 2.0  #: growth per second below the initial rate, or while n
 MOST_WAIT_S: Final = 0.08  #: maximum delivery time of the frames in flight, beyond the shortest round trip
 SILENT_S: Final = 0.3  #: a path that carries nothing for this long has stalled (the rate is not the cause)
 SILENT_FALL: Final = 0.5  #: factor for the rate after a stall, because the path's rate is then uncertain
-PROBE_S: Final = 0.15  #: interval between frames while frames wait
+PROBE_S: Final = 0.15  #: interval between frames while frames wait in the path
 PROBES_S: Final = 0.1  #: no frame is sent if more is in flight than the rate delivers in this time
 SELDOM: Final = 1 / 3  #: during silence, the interval is this fraction of the silence so far
 SELDOM_S: Final = 0.5  #: maximum interval between frames during silence
@@ -95,7 +95,7 @@ class StreamRate:
 
     def _holds(self, time_s: float) -> bool:
         """Return whether the rate delivers everything that is in flight within this time [s]."""
-        return self._bytes * 8e-3 <= self.kbit_s * time_s
+        return self._bytes * 8e-3 <= self.kbit_s * time_s  # 8e-3: from bytes to kbit
 
     def sent(self, seq: int, size: int, now_ns: int) -> None:
         """Record that a frame was handed to the transport. ``seq`` is higher than for all earlier frames."""
@@ -122,7 +122,7 @@ class StreamRate:
         trip_ns = now_ns - newest.sent_ns
         self._add_trip(trip_ns, now_ns)
         wait_s = seconds(trip_ns - self._least_ns())
-        step_s = min(seconds(now_ns - self._changed_ns), 0.2)
+        step_s = min(seconds(now_ns - self._changed_ns), 0.2)  # after a pause, the rate must not jump
         self._changed_ns = now_ns
         waits = self._waits
         if wait_s > SILENT_S:
@@ -173,7 +173,7 @@ class StreamRate:
             self._shortest.popleft()
 
     def _least_ns(self) -> int:
-        return self._shortest[0][0] if self._shortest else nanoseconds(0.1)
+        return self._shortest[0][0] if self._shortest else nanoseconds(0.1)  # assumed until one is measured
 
 
 #: Factors for the frame's size, and fractions of the frames to send, best first. If the rate is too low for good frames
