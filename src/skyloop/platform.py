@@ -18,7 +18,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import IO, Any, Final, Protocol
+from typing import IO, TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from _typeshed import FileDescriptorLike
 
 # learn.microsoft.com/windows/win32/procthread/process-creation-flags
 _CREATE_NEW_PROCESS_GROUP: Final = 0x00000200
@@ -72,13 +75,7 @@ def read_tail(descriptor: int, most: int) -> bytes:
         os.lseek(descriptor, 0, os.SEEK_END)
 
 
-class Descriptor(Protocol):
-    """Anything with a file descriptor."""
-
-    def fileno(self) -> int: ...
-
-
-def wait_readable(source: Descriptor | int, within_s: float) -> bool:
+def wait_readable(source: FileDescriptorLike, within_s: float) -> bool:
     """Wait until a descriptor is readable or closed; return False if neither happens within ``within_s`` [s].
 
     Works for any descriptor number; ``select.select`` raises an error from 1,024 on. On Windows, for sockets only.
