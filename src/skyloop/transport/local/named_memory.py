@@ -1,11 +1,12 @@
 """Frame slots in named shared memory, which clients map by name.
 
-Windows frees such memory with its last user. Elsewhere the name stays until it is removed: by the server that made it,
-or after the server's death by its *keeper*, a small process that waits for that. Should both be killed, then whoever
-lists or starts a proxy next removes the names, which the server's registration tells (:func:`remove_names`).
+Windows frees such memory with its last user. On other systems, the name stays until it is removed. The server that made
+it does so or, if the server is killed, its *keeper*, a small process that waits for the server's end. If both are
+killed, the next process that lists or starts a proxy removes the names, which are in the server's registration
+(:func:`remove_names`).
 
-This does without ``multiprocessing.shared_memory``, whose clients could write to the frames. Before Python 3.13, they
-would also remove the memory when they end (https://github.com/python/cpython/issues/82300).
+With ``multiprocessing.shared_memory``, clients could write to the frames. Before Python 3.13, they would also remove
+the memory when they end (https://github.com/python/cpython/issues/82300).
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class _Process:
         self._keeper: ChildProcess | None = None
 
     def keep(self) -> None:
-        """Start the keeper if it does not run. Without it, names of a killed process stay until the next listing."""
+        """Start the keeper unless it runs. Without one, a killed process leaves its names until the next listing."""
         if sys.platform == "win32" or (self._keeper is not None and self._keeper.code is None):
             return
         with self._lock:

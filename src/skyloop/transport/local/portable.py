@@ -107,8 +107,8 @@ class StreamSocket:
         # Re-entrant, because the garbage collector or a signal's handler may send in the middle of another call.
         self._sending = threading.RLock()
         self._inside = False  # whether a call that sends is under way
-        self._rest = b""  # what is left of a packet that was sent in part
-        self._partial = bytearray()  # what has arrived of an incomplete packet, including its length
+        self._rest = b""  # the unsent end of a packet that was sent in part
+        self._partial = bytearray()  # the beginning of an incomplete packet, with its length
         self._ended = False
 
     def __del__(self) -> None:
