@@ -83,9 +83,9 @@ def test_a_proof_as_the_page_says_is_accepted(runtime_dir: Path) -> None:
     [
         ("wrong secret", "does not know the proxy's secret"),
         ("replayed", "does not know the proxy's secret"),
-        ("old version", "its handshake is of version 0, not 1"),
+        ("old version", "does not speak version 1 of the local transport's handshake"),
         ("garbage", "does not speak"),
-        ("http", "does not speak"),
+        ("little garbage", "did not prove within 0.05 s"),
         ("slow", "did not prove within 0.05 s"),
         ("silent", "did not prove within 0.05 s"),
     ],
@@ -93,7 +93,7 @@ def test_a_proof_as_the_page_says_is_accepted(runtime_dir: Path) -> None:
 def test_strangers_are_turned_away_without_a_word(
     runtime_dir: Path, kind: str, complaint: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if kind in ("slow", "silent"):
+    if kind in ("slow", "silent", "little garbage"):
         monkeypatch.setattr(portable, "HANDSHAKE_S", 0.05)
     with serving() as (_, log):
         ours = registration(runtime_dir)
@@ -102,8 +102,8 @@ def test_strangers_are_turned_away_without_a_word(
                 "wrong secret": proof(ours._replace(secret=bytes(32)), nonce),
                 "replayed": proof(ours, bytes(32)),
                 "old version": proof(ours, nonce, version=0),
-                "garbage": b"\xff" * 10,
-                "http": b"GET / HTTP/1.1\r\n",
+                "garbage": b"GET / HTTP/1.1\r\n" * 10,
+                "little garbage": b"\xff" * 10,
                 "slow": proof(ours, nonce)[:-1],
                 "silent": b"",
             }[kind]
@@ -508,7 +508,7 @@ def test_memory_of_a_proxy_killed_with_its_keeper_is_removed_by_the_next_listing
         proxy.wait()
         client.close()
         assert named(begin) != []
-        assert list_names() == []
+        wait_within(5.0, lambda: not list_names())  # it may be starting another keeper, which holds its lock until then
         assert named(begin) == []
 
 

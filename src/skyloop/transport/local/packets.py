@@ -171,7 +171,8 @@ def parse(packet: bytes) -> Message:
             name = body[_SLOT.size :].decode()
             if not MEMORY_NAME.fullmatch(name):
                 raise DecodeError(f"{name[:64]!r} can't be the name of a slot's memory")
-            return NamedSlot(*_SLOT.unpack_from(body), name)
+            number, camera, capacity = _SLOT.unpack_from(body)
+            return NamedSlot(number, camera, capacity, name)
         layout, message = _FIXED[kind]
         return message(*layout.unpack(body))
     except (KeyError, IndexError, struct.error, UnicodeDecodeError) as error:

@@ -60,7 +60,6 @@ _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = MAX_PACKET + 1024  # more than any packet has, including those that announce a frame
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
 _LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
-_IDLE_S: Final = 60.0
 _MOST_WAITING: Final = 128
 _FAILED_S: Final = 0.2  # pause after a failure to accept, when descriptors or memory have run out
 _REGISTRATION: Final = struct.Struct("<8sHHI32s32s")  # magic, version, port, process, secret, names of its memory
@@ -86,6 +85,7 @@ class Registration(NamedTuple):
         return hmac.digest(self.secret, said, hashlib.sha256)
 
 
+_TURNED_AWAY: Final = "a process that wanted to connect was turned away"
 _CLIENT: Final = b"skyloop client"
 _SERVER: Final = b"skyloop server"
 
@@ -452,52 +452,29 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
     return content
 
 
-class _Stranger:
-    """A connection whose other end has not proved yet that it knows the secret."""
-
-    def __init__(self, sock: socket.socket, registration: Registration) -> None:
-        sock.setblocking(False)
-        self.sock = sock
-        self.until_s = time.monotonic() + HANDSHAKE_S
-        self._registration = registration
-        self._nonce = secrets.token_bytes(_NONCE)
-        self._content = b""
-        sock.send(self._nonce)
-
-    def receive(self) -> StreamSocket | None:
-        """Return the connection once the other end has proved itself. Raises ``OSError`` when it must end."""
-        try:
-            more = self.sock.recv(_PROOF.size - len(self._content))
-        except BlockingIOError:
-            return None
-        if not more:
-            raise ConnectionAbortedError  # it only looked who is there, or gave up
-        self._content += more
-        if not _PROOF_MAGIC.startswith(self._content[: len(_PROOF_MAGIC)]):
-            raise StrangerError("it does not speak the local transport's protocol")
-        if len(self._content) < _PROOF.size:
-            return None
-        _, version, pid, nonce, mac = _PROOF.unpack(self._content)
-        if version != VERSION:
-            raise StrangerError(f"its handshake is of version {version}, not {VERSION}")
-        if not hmac.compare_digest(mac, self._registration.mac(_CLIENT, self._nonce, nonce, pid)):
-            raise StrangerError("it does not know the proxy's secret")
-        self.sock.send(self._registration.mac(_SERVER, self._nonce, nonce, pid))
-        return StreamSocket(self.sock, Credentials(pid, own_uid(), 0))
+def _challenge(sock: socket.socket, registration: Registration, deadline_s: float) -> int:
+    """Return the process at the other end if it knows the secret. Raises :class:`StrangerError` if it does not."""
+    ours = secrets.token_bytes(_NONCE)
+    sock.sendall(ours)
+    magic, version, pid, theirs, mac = _PROOF.unpack(_receive(sock, _PROOF.size, deadline_s))
+    if magic != _PROOF_MAGIC or version != VERSION:
+        raise StrangerError(f"it does not speak version {VERSION} of the local transport's handshake")
+    if not hmac.compare_digest(mac, registration.mac(_CLIENT, ours, theirs, pid)):
+        raise StrangerError("it does not know the proxy's secret")
+    sock.sendall(registration.mac(_SERVER, ours, theirs, pid))
+    return pid
 
 
 class Gate:
-    """A server's socket. Its thread lets only those in that know the secret."""
+    """A server's socket. It lets only those in that know the secret, each of which has a thread until then."""
 
     def __init__(self, listener: socket.socket, registration: Registration, path: Path, lock: int) -> None:
-        listener.setblocking(False)
+        listener.settimeout(HANDSHAKE_S)
         self._listener = listener
         self._registration = registration
         self._path = path
         self._lock = lock
-        self._poller = SelectorPoller()
-        self._poller.register(listener.fileno())
-        self._strangers: dict[int, _Stranger] = {}  # by descriptor, oldest first
+        self._strangers: dict[socket.socket, None] = {}  # oldest first
         self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
         self._woken, self._bell = socket.socketpair()  # a byte for each of those
         self._bell.setblocking(False)
@@ -530,77 +507,52 @@ class Gate:
 
     def hang_up(self) -> None:
         self._closing = True
-        self._poller.wake()
+        with suppress(OSError):  # wakes the thread, which otherwise looks every two seconds
+            socket.create_connection((_HOST, self._registration.port), CONNECT_TIMEOUT_S).close()
         self._thread.join()
-
-    def close(self) -> None:
-        self.hang_up()
-
-    # --- on its thread ---
 
     def _run(self) -> None:
         while not self._closing:
             try:
-                for fileno, _ in self._poller.poll(HANDSHAKE_S / 4 if self._strangers else _IDLE_S):
-                    if fileno == self._listener.fileno():
-                        self._accept()
-                    elif fileno in self._strangers:
-                        self._receive(fileno)
-                    else:
-                        self._poller.drain()
-                now_s = time.monotonic()
-                for fileno in [number for number, stranger in self._strangers.items() if stranger.until_s < now_s]:
-                    self._turn_away(fileno, f"it did not prove within {HANDSHAKE_S:g} s that it knows the secret")
-            except OSError as error:  # descriptors or memory have run out
-                if not self._closing:
-                    _log.warning("%s cannot accept: %s", self._path.name, error)
-                    time.sleep(_FAILED_S)
+                sock, _ = self._listener.accept()
+                if len(self._strangers) >= MAX_STRANGERS:
+                    oldest = next(iter(self._strangers))
+                    oldest.shutdown(socket.SHUT_RDWR)
+                    self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
+                self._strangers[sock] = None
+                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
+            except (TimeoutError, ConnectionError):
+                continue
+            except (OSError, RuntimeError) as error:  # descriptors, memory or threads have run out
+                _log.warning("%s cannot accept: %s", self._path.name, error)
+                time.sleep(_FAILED_S)
         self._listener.close()
-        for stranger in self._strangers.values():
-            stranger.sock.close()
         if sys.platform != "win32":  # a locked file can be removed, so that no one takes it for that of a killed proxy
             with suppress(OSError):
                 if self._path.lstat().st_ino == os.fstat(self._lock).st_ino:
                     self._path.unlink()
         os.close(self._lock)
         self._bell.close()
-        self._poller.close()
 
-    def _accept(self) -> None:
+    def _greet(self, sock: socket.socket) -> None:
+        found: StreamSocket | str = ""
         try:
-            sock, _ = self._listener.accept()
-        except (BlockingIOError, ConnectionError):
-            return
-        if len(self._strangers) >= MAX_STRANGERS:
-            self._turn_away(next(iter(self._strangers)), "others wanted to connect")
-        try:
-            self._strangers[sock.fileno()] = _Stranger(sock, self._registration)
-        except ConnectionError:
-            sock.close()
-        else:
-            self._poller.register(sock.fileno())
-
-    def _receive(self, fileno: int) -> None:
-        try:
-            connection = self._strangers[fileno].receive()
+            pid = _challenge(sock, self._registration, time.monotonic() + HANDSHAKE_S)
+            found = StreamSocket(sock, Credentials(pid, own_uid(), 0))
         except StrangerError as error:
-            self._turn_away(fileno, str(error))
-        except ConnectionError:
-            self._turn_away(fileno, "")
-        else:
-            if connection is not None:
-                self._poller.unregister(fileno)
-                del self._strangers[fileno]
-                self._pass_on(connection)
-
-    def _turn_away(self, fileno: int, reason: str) -> None:
-        """End a stranger's connection without a word."""
-        self._poller.unregister(fileno)
-        self._strangers.pop(fileno).sock.close()
-        if reason:
-            self._pass_on(f"a process that wanted to connect was turned away: {reason}")
+            found = f"{_TURNED_AWAY}: {error}"
+        except TimeoutError:
+            found = f"{_TURNED_AWAY}: it did not prove within {HANDSHAKE_S:g} s that it knows the secret"
+        except OSError:
+            pass  # it only looked who is there, or gave up
+        self._strangers.pop(sock, None)
+        if isinstance(found, str):
+            sock.close()
+        if found:
+            self._pass_on(found)
 
     def _pass_on(self, found: StreamSocket | str) -> None:
         if len(self._waiting) < _MOST_WAITING:  # otherwise, the server is too busy to accept anybody
             self._waiting.append(found)
-            self._bell.send(b"\0")
+            with suppress(OSError):  # it no longer listens
+                self._bell.send(b"\0")
