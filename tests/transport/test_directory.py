@@ -16,7 +16,7 @@ import pytest
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UsageError
 from skyloop.transport.local import LocalServer, dial, list_names, names_of_others
 from skyloop.transport.local.directory import directory_owner, find_directory, of_others
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.local.fast import Socket
 from skyloop.transport.local.system import FAST, PORTABLE, serving_side, systems, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 

@@ -20,9 +20,8 @@ from skyloop.messages.codec import HEADER
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, TransportClient
 from skyloop.transport.local import LocalServer, dial, packets
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.fast import SealedSlot
+from skyloop.transport.local.fast import SealedSlot, Socket
 from skyloop.transport.local.frame_exchange import SlotMemory
-from skyloop.transport.local.sockets import Socket
 from skyloop.transport.local.system import FAST, PORTABLE, PacketSocket
 from skyloop.transport.testing import ClientLog, ServerLog, header, wait_until
 

@@ -22,7 +22,7 @@ from skyloop.errors import LinkError
 from skyloop.transport.base import FEEDBACK, video
 from skyloop.transport.local import LocalServer, dial, list_names, packets
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.local.fast import Socket
 from skyloop.transport.local.system import FAST
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 

@@ -19,14 +19,14 @@ from skyloop.messages import EventKind, Hello, Refusal, Refused, Role, Welcome
 from skyloop.proxy.requests import HELLO_NS
 from skyloop.transport.local import LocalServer, dial, list_names
 from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.fast import Socket, connect
 from skyloop.transport.local.packets import Bye, hello, parse
-from skyloop.transport.local.sockets import Socket, connect
 from skyloop.transport.local.system import Credentials
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 from tests.support.proxy_bench import WAIT_S, Bench
 
 SERVER = "skyloop.transport.local.server"
-SOCKETS = "skyloop.transport.local.sockets"
+SOCKETS = "skyloop.transport.local.fast"
 
 
 class Place:

@@ -29,9 +29,6 @@ _AUTO: Final = "auto"
 PROXY: Final = "proxy"
 HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 CONNECT_TIMEOUT_S: Final = 1.0
-#: Size of the send buffer. It has room for the largest packet and a burst of small packets, but is small enough to
-#: bound the backlog of a stalled reader (about 200 packets of 300 bytes).
-SEND_BUFFER: Final = 131_072
 RECEIVE_FLAGS: Final[int] = getattr(socket, "MSG_DONTWAIT", 1)  #: flags for callers that wait by other means
 SEND_FLAGS: Final[int] = RECEIVE_FLAGS | getattr(socket, "MSG_NOSIGNAL", 0)
 
@@ -50,25 +47,19 @@ class Credentials(NamedTuple):
 class PacketSocket(Protocol):
     """One end of a connection that carries whole packets. Any thread may send; one thread at a time may receive.
 
-    ``send`` and ``post`` never wait: ``BlockingIOError`` if the packet does not fit now, another ``OSError`` if the
-    connection has ended. The socket closes when nothing refers to it any more.
+    Sending never waits: ``BlockingIOError`` if the packet does not fit now, another ``OSError`` if the connection has
+    ended. Receiving waits as long as :meth:`limit_wait` allows, or not at all with :data:`RECEIVE_FLAGS`, and then
+    raises ``BlockingIOError``. The socket closes when nothing refers to it any more.
     """
 
     @property
-    def who(self) -> Credentials:
-        """The process at the other end."""
-
+    def who(self) -> Credentials: ...  # the process at the other end
     @property
-    def recv(self) -> Callable[..., bytes]:
-        """Function of a size and flags that returns the next packet, cut to that size; empty at the end.
-
-        With :data:`RECEIVE_FLAGS` it does not wait; without flags, it waits as long as :meth:`limit_wait` allows.
-        ``BlockingIOError``: nothing arrived.
-        """
-
+    def send(self) -> Callable[..., int]: ...  # of a packet and SEND_FLAGS
     @property
-    def send(self) -> Callable[..., int]:
-        """Function of a packet and :data:`SEND_FLAGS`."""
+    def recv(self) -> Callable[..., bytes]: ...  # of a size and flags; returns a packet cut to it, empty at the end
+    def fileno(self) -> int: ...
+    def close(self) -> None: ...
 
     def post(self, packet: bytes) -> None:
         """Send a packet without waiting for any lock, because the garbage collector may call this at any point."""
@@ -92,7 +83,7 @@ class PacketSocket(Protocol):
         """Return a function that waits for some time [ms], and returns whether a packet or the end is waiting."""
 
     def limit_wait(self, seconds: float) -> None:
-        """Limit how long receiving waits [s] before it raises ``BlockingIOError``. 0 means no limit."""
+        """Limit how long receiving waits [s]. 0 means no limit."""
 
     def limit_backlog(self) -> None:
         """Limit the data that waits to be read at the other end."""
@@ -100,65 +91,42 @@ class PacketSocket(Protocol):
     def hang_up(self, last_packet: bytes = b"") -> None:
         """End the connection in both directions. A last packet is sent first if it fits into the buffer."""
 
-    def fileno(self) -> int: ...
-
-    def close(self) -> None: ...
-
 
 class StrangerError(ConnectionError):
     """A process that wanted to connect, but did not prove that it may."""
 
 
 class Listener(Protocol):
-    """A server's socket, which accepts connections."""
+    """A server's socket. ``accept`` also raises :class:`StrangerError`; ``hang_up`` wakes the thread that is in it."""
 
-    def accept(self) -> tuple[PacketSocket, object]:
-        """Return a new connection. Raises ``OSError``, or :class:`StrangerError` for one that was turned away."""
-
+    def accept(self) -> tuple[PacketSocket, object]: ...
     def setblocking(self, flag: bool, /) -> None: ...
-
     def fileno(self) -> int: ...
-
-    def hang_up(self) -> None:
-        """Stop listening, and wake the accepting thread."""
+    def hang_up(self) -> None: ...
 
 
 class Poller(Protocol):
-    """Waits for many descriptors to become readable. Any thread may call all methods except :attr:`poll`."""
+    """Waits for descriptors to become readable. Any thread may call everything else than ``poll`` and ``drain``."""
 
-    waker: int  #: the descriptor that :attr:`poll` reports after :meth:`wake`
+    waker: int  #: the descriptor that ``poll`` reports after ``wake``, until ``drain``
 
     @property
-    def poll(self) -> Callable[[float], list[tuple[int, int]]]:
-        """Function that waits for some time [s] and returns pairs, each of a descriptor and something else."""
-
+    def poll(self) -> Callable[[float], list[tuple[int, int]]]: ...  # of a time [s]; the pairs begin with a descriptor
     def register(self, fileno: int) -> None: ...
-
-    def unregister(self, fileno: int) -> None:
-        """Forget a descriptor. Ignored after :meth:`close`."""
-
-    def mute(self, fileno: int, muted: bool) -> None:
-        """Ignore a registered descriptor for some time."""
-
+    def unregister(self, fileno: int) -> None: ...  # ignored after ``close``
+    def mute(self, fileno: int, muted: bool) -> None: ...  # ignores a descriptor for some time
     def wake(self) -> None: ...
-
-    def drain(self) -> None:
-        """Make the waker unreadable again."""
-
+    def drain(self) -> None: ...
     def close(self) -> None: ...
 
 
 class System(Protocol):
-    """One side, which is a module. Each proxy has one file in the directory, at ``path``; the calls raise OSError."""
+    """One side, which is a module. Each server has one file in the directory. All calls may raise ``OSError``."""
 
     @property
-    def SUFFIXES(self) -> dict[str, str]:  # noqa: N802
-        """The files' suffixes, for :data:`PROXY` and :data:`HOST`."""
-
+    def SUFFIXES(self) -> dict[str, str]: ...  # noqa: N802  the files' suffixes, for PROXY and HOST
     @property
-    def new_slot(self) -> Callable[[int, int, int], SlotMemory]:
-        """Function of a number, a generation and a capacity that reserves memory for frames."""
-
+    def new_slot(self) -> Callable[[int, int, int], SlotMemory]: ...  # of a number, a generation and a capacity
     @property
     def new_poller(self) -> Callable[[], Poller]: ...
 
@@ -169,7 +137,10 @@ class System(Protocol):
         """Listen at a path where no file is. ``gid``: the group whose members may connect, if any."""
 
     def connect(self, path: Path) -> PacketSocket:
-        """Connect within :data:`CONNECT_TIMEOUT_S`; ``BlockingIOError``: the server does not accept."""
+        """Connect within :data:`CONNECT_TIMEOUT_S`; ``BlockingIOError`` if the server does not accept."""
+
+    def may_connect(self, sock: PacketSocket, gid: int | None) -> bool:
+        """Return whether the process at the other end may connect."""
 
     def is_live(self, path: Path) -> bool:
         """Return whether a process still serves at this path."""
@@ -179,9 +150,6 @@ class System(Protocol):
 
     def remove(self, path: Path) -> None:
         """Remove what a process that has ended left behind, if anything."""
-
-    def may_connect(self, sock: PacketSocket, gid: int | None) -> bool:
-        """Return whether the process at the other end may connect."""
 
 
 @functools.cache
@@ -223,7 +191,9 @@ def user_name(uid: int) -> str:
 
 def own_uid() -> int:
     """Return this process's effective user; 0 on Windows, which has no such numbers."""
-    return os.geteuid() if sys.platform != "win32" else 0
+    if sys.platform == "win32":
+        return 0
+    return os.geteuid()
 
 
 def try_lock(descriptor: int, *, shared: bool = False) -> bool:
