@@ -326,8 +326,8 @@ def listen(path: Path, gid: int | None) -> Gate:
         )
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        if sys.platform == "win32":  # otherwise, another program could listen on the same port
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+        if exclusive := getattr(socket, "SO_EXCLUSIVEADDRUSE", 0):  # Windows would let others listen on the same port
+            listener.setsockopt(socket.SOL_SOCKET, exclusive, 1)
         _limit_received(listener)
         listener.bind((_HOST, 0))
         listener.listen(128)
@@ -454,6 +454,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
 
 def _challenge(sock: socket.socket, registration: Registration, deadline_s: float) -> int:
     """Return the process at the other end if it knows the secret. Raises :class:`StrangerError` if it does not."""
+    pid: int
     ours = secrets.token_bytes(_NONCE)
     sock.sendall(ours)
     magic, version, pid, theirs, mac = _PROOF.unpack(_receive(sock, _PROOF.size, deadline_s))
@@ -515,17 +516,25 @@ class Gate:
         while not self._closing:
             try:
                 sock, _ = self._listener.accept()
-                if len(self._strangers) >= MAX_STRANGERS:
-                    oldest = next(iter(self._strangers))
-                    oldest.shutdown(socket.SHUT_RDWR)
-                    self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
-                self._strangers[sock] = None
-                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
             except (TimeoutError, ConnectionError):
                 continue
-            except (OSError, RuntimeError) as error:  # descriptors, memory or threads have run out
+            except OSError as error:  # descriptors or memory have run out
                 _log.warning("%s cannot accept: %s", self._path.name, error)
                 time.sleep(_FAILED_S)
+                continue
+            if len(self._strangers) >= MAX_STRANGERS:
+                oldest = next(iter(self._strangers))
+                self._strangers.pop(oldest)
+                with suppress(OSError):  # its thread ends it
+                    oldest.shutdown(socket.SHUT_RDWR)
+                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
+            self._strangers[sock] = None
+            try:
+                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
+            except RuntimeError as error:  # no more threads
+                _log.warning("%s cannot accept: %s", self._path.name, error)
+                self._strangers.pop(sock)
+                sock.close()
         self._listener.close()
         if sys.platform != "win32":  # a locked file can be removed, so that no one takes it for that of a killed proxy
             with suppress(OSError):
