@@ -35,7 +35,7 @@ from typing import Any, Final, NamedTuple
 
 from skyloop.child_process import leave_to_parent
 from skyloop.errors import LinkError, UsageError
-from skyloop.transport.base import MAX_PACKET, Pixels
+from skyloop.transport.base import Pixels
 from skyloop.transport.local.named_memory import NamedSlot, prefix, remove_names
 from skyloop.transport.local.system import (
     CONNECT_TIMEOUT_S,
@@ -57,7 +57,7 @@ _HOST: Final = "127.0.0.1"
 #: on the fast side. Larger packets are sent in part, and completed while the other end reads.
 _BUFFER: Final = 16_384
 _LENGTH: Final = 4  # bytes before each packet
-_LONGEST: Final = MAX_PACKET + 1024  # more than any packet has, including those that announce a frame
+_LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
 _LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
 _MOST_WAITING: Final = 128
@@ -94,15 +94,22 @@ def check_support() -> None:
     """Do nothing: this side works everywhere."""
 
 
+class _TcpSocket(socket.socket):
+    """A socket that closes itself when nothing refers to it any more."""
+
+    def __del__(self) -> None:
+        self.close()
+
+
 class StreamSocket:
     """A TCP connection that carries packets; see :class:`skyloop.transport.local.system.PacketSocket`."""
 
     def __init__(self, sock: socket.socket, who: Credentials) -> None:
-        sock.setblocking(False)
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.who = who
-        self._socket = sock
-        self._poll = _waiter(sock)
+        self._socket = _TcpSocket(fileno=sock.detach())
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._poll = _waiter(self._socket)
         self._wait_s = 0.0
         # Re-entrant, because the garbage collector or a signal's handler may send in the middle of another call.
         self._sending = threading.RLock()
@@ -110,9 +117,6 @@ class StreamSocket:
         self._rest = b""  # the unsent end of a packet that was sent in part
         self._partial = bytearray()  # the beginning of an incomplete packet, with its length
         self._ended = False
-
-    def __del__(self) -> None:
-        self.close()
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -478,6 +482,7 @@ class Gate:
         self._strangers: dict[socket.socket, None] = {}  # oldest first
         self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
         self._woken, self._bell = socket.socketpair()  # a byte for each of those
+        self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
         self._bell.setblocking(False)
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="skyloop-gate", daemon=True)
