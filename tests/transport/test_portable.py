@@ -203,7 +203,7 @@ def test_a_stopped_proxy_does_not_block_a_caller() -> None:
         began = time.monotonic()
         with pytest.raises(LinkError, match="does not accept"):
             dial("alpha")(ClientLog())
-        assert time.monotonic() - began < 2.0
+        assert time.monotonic() - began < 6.0
         assert [proxy.name for proxy in list_names()] == ["alpha"], "it is listed, although busy"
 
 

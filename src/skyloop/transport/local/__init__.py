@@ -25,7 +25,7 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
     """Return a dialer for a proxy on this host. ``group``: users who share its directory (default: ``SKYLOOP_GROUP``).
 
     The dialer raises :class:`UnknownNameError` if there is no such proxy, and :class:`LinkError` if the proxy does not
-    accept the connection (it was killed, is stopped, or is another user's). It returns or raises within about a second.
+    accept the connection (it was killed, is stopped, or is another user's). It returns or raises within 3 s.
     """
     from skyloop.transport.local.client import LocalClient
     from skyloop.transport.local.directory import find_directory

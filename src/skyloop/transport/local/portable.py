@@ -50,7 +50,7 @@ from skyloop.transport.local.system import (
 
 SUFFIXES: Final = {PROXY: ".port", HOST: ".hostport"}
 VERSION: Final = 1  #: of the registration and the handshake
-HANDSHAKE_S: Final = 2.0  #: time for a client to prove that it knows the secret
+HANDSHAKE_S: Final = 2.0  #: time for both ends to prove that they know the secret
 MAX_STRANGERS: Final = 32  #: connections that have not done that yet; of more, the oldest is closed
 _HOST: Final = "127.0.0.1"
 #: Size of each end's buffer. On Linux, 290 packets of 66 bytes or 66 of 300 wait for a stalled reader, about as many as
@@ -360,7 +360,7 @@ def _register(path: Path, registration: Registration) -> int:
     except BaseException:
         Path(part).unlink(missing_ok=True)
         raise
-    descriptor = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0))
+    descriptor = os.open(path, os.O_RDWR)
     deadline_s = time.monotonic() + _LOCKED_WITHIN_S
     while not try_lock(descriptor):  # others hold it for a moment when they look
         if time.monotonic() > deadline_s:
@@ -384,7 +384,7 @@ def _read(path: Path) -> Registration:
 
 def is_live(path: Path) -> bool:
     try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0))
+        descriptor = os.open(path, os.O_RDONLY)
     except FileNotFoundError:
         return False
     except OSError:
@@ -420,12 +420,11 @@ def connect(path: Path) -> StreamSocket:
     if not is_live(path):
         raise ConnectionRefusedError(errno.ECONNREFUSED, "its process has ended")
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    deadline_s = time.monotonic() + CONNECT_TIMEOUT_S
     try:
         _limit_received(sock)
         sock.settimeout(CONNECT_TIMEOUT_S)
         sock.connect((_HOST, registration.port))
-        _introduce(sock, registration, deadline_s)
+        _introduce(sock, registration, time.monotonic() + HANDSHAKE_S)
     except TimeoutError:
         sock.close()
         raise BlockingIOError(errno.EAGAIN, "it does not answer") from None
@@ -495,7 +494,8 @@ class Gate:
     def forked(self) -> None:
         """Close a forked child's copies. Otherwise, the registration would stay locked after the parent's end."""
         self._listener.close()
-        os.close(self._lock)
+        if self._lock >= 0:
+            os.close(self._lock)
 
     def fileno(self) -> int:
         return self._woken.fileno()
@@ -527,9 +527,8 @@ class Gate:
                 _log.warning("%s cannot accept: %s", self._path.name, error)
                 time.sleep(_FAILED_S)
                 continue
-            if len(self._strangers) >= MAX_STRANGERS:
-                oldest = next(iter(self._strangers))
-                self._strangers.pop(oldest)
+            if len(self._strangers) >= MAX_STRANGERS and (oldest := next(iter(self._strangers), None)):
+                self._strangers.pop(oldest, None)
                 with suppress(OSError):  # its thread ends it
                     oldest.shutdown(socket.SHUT_RDWR)
                 self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
@@ -545,7 +544,8 @@ class Gate:
             with suppress(OSError):
                 if self._path.lstat().st_ino == os.fstat(self._lock).st_ino:
                     self._path.unlink()
-        os.close(self._lock)
+        lock, self._lock = self._lock, -1
+        os.close(lock)
         self._bell.close()
 
     def _greet(self, sock: socket.socket) -> None:

@@ -137,7 +137,7 @@ class System(Protocol):
         """Listen at a path where no file is. ``gid``: the group whose members may connect, if any."""
 
     def connect(self, path: Path) -> PacketSocket:
-        """Connect within :data:`CONNECT_TIMEOUT_S`; ``BlockingIOError`` if the server does not accept."""
+        """Connect; ``BlockingIOError`` if the server does not accept within a few seconds."""
 
     def may_connect(self, sock: PacketSocket, gid: int | None) -> bool:
         """Return whether the process at the other end may connect."""
