@@ -32,7 +32,7 @@ from skyloop.errors import MissingExtraError, UsageError
 
 def peers(
     peers: Annotated[
-        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq (comma-separated), all or none")
+        str, typer.Option(help="Compare with portable, fabric, ros2, zenoh, zeromq (comma-separated), all or none")
     ] = "all",
     ros_python: Annotated[
         str | None, typer.Option(help="Python interpreter with rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")

@@ -21,3 +21,4 @@ class Contender:
 OURS: Final = Contender("skyloop", "Skyloop", "benchmarks.measuring.ours")
 FLOOR: Final = Contender("floor", "bare hand-over", "benchmarks.measuring.floor")
 NETWORK: Final = Contender("fabric", "Skyloop over the network", "benchmarks.measuring.over_loopback")
+PORTABLE: Final = Contender("portable", "Skyloop, portable transport", "benchmarks.measuring.over_portable")

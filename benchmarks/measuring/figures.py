@@ -22,6 +22,7 @@ _COLOURS: Final = {"command": "#0b6e99", "feedback": "#d9730d", "video": "#4d8c5
 _OTHERS: Final = {
     "floor": "#9a9a9a",
     "skyloop": "#0b6e99",
+    "portable": "#3f8f7a",
     "fabric": "#4f9da6",
     "zeromq": "#c29243",
     "zenoh": "#7b5ea7",

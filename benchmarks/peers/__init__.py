@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from benchmarks.measuring.contenders import NETWORK, Contender
+from benchmarks.measuring.contenders import NETWORK, PORTABLE, Contender
 from skyloop.errors import UnknownNameError
 
 ROS_PYTHON_VARIABLE: Final = "SKYLOOP_ROS_PYTHON"
@@ -39,6 +39,7 @@ PEERS: Final = {
         "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in a separate environment, "
         "whose interpreter --ros-python names",
     ),
+    "portable": Peer(PORTABLE.title, "skyloop", "skyloop", "pip install skyloop", PORTABLE.module),
     "fabric": Peer(NETWORK.title, "zenoh", "eclipse-zenoh", "skyloop install network", NETWORK.module),
     "zenoh": Peer("Zenoh", "zenoh", "eclipse-zenoh", "pip install eclipse-zenoh"),
     "zeromq": Peer("ZeroMQ", "zmq", "pyzmq", "pip install pyzmq"),

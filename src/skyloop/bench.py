@@ -52,6 +52,7 @@ from skyloop.platform import usable_cores
 from skyloop.proxy import Proxy
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
+from skyloop.transport.local.system import serving_side
 
 if TYPE_CHECKING:
     from skyloop.sim import Simulation
@@ -430,6 +431,7 @@ class DelayResults(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
     machine: Machine
     seconds: float
     rows: list[DelayRow]
+    transport: str = ""  #: side of the local transport that was measured: fast or portable
 
 
 def measure_delays(
@@ -459,7 +461,7 @@ def measure_delays(
             if not ours or not bare:
                 raise LinkError(f"not one sample of {channel} with frames of {named(size)} arrived")
             rows.append(DelayRow(named(size), channel, spread(ours), spread(bare), max(0, sent[channel] - len(ours))))
-    return DelayResults(machine, seconds, rows)
+    return DelayResults(machine, seconds, rows, serving_side())
 
 
 def named(size: tuple[int, int]) -> str:

@@ -103,11 +103,15 @@ def test_an_impossible_directory_is_a_fault(run: Run, monkeypatch: pytest.Monkey
     assert "✗ local transport: /proc/none/run can't be created" in ended.out
 
 
-def test_an_unsupported_system_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sys.platform", "darwin")
+def test_the_portable_transport_is_reported(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_TRANSPORT", "portable")
+    ended = run("doctor")
+    assert ended.code == 0, ended.out
+    assert "✓ local transport: portable: loopback TCP and named memory, registrations in" in ended.out
+    monkeypatch.setenv("SKYLOOP_TRANSPORT", "fast")
     ended = run("doctor")
     assert ended.code == 1
-    assert "✗ local transport: needs Linux" in ended.out
+    assert "✗ local transport: UsageError: SKYLOOP_TRANSPORT is 'fast'; it must be 'portable'" in ended.out
 
 
 def test_a_driver_that_fails_to_load_is_a_separate_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

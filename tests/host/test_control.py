@@ -28,7 +28,8 @@ from skyloop.host.serve import (
     respond,
     running_hosts,
 )
-from skyloop.transport.local.directory import HOST, connect, find_directory
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.system import HOST
 from tests.host.fleet import Hosting
 
 
@@ -84,7 +85,7 @@ def test_errors_are_raised_again_at_the_client(served: Hosting) -> None:
 
 def test_garbage_and_silent_callers_do_no_harm(served: Hosting) -> None:
     for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * serve.MAX_PACKET):
-        sock = connect(find_directory(None, HOST).socket_path("host"))
+        sock = find_directory(None, HOST).connect("host")
         if packet:
             sock.send(packet)
             answer = msgspec.json.decode(sock.recv(1 << 16), type=Answer)
@@ -101,7 +102,7 @@ def test_a_large_answer_arrives_whole(served: Hosting) -> None:
 
 
 def test_other_users_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serve, "may_connect", lambda sock, gid: False)
+    monkeypatch.setattr("skyloop.transport.local.fast.may_connect", lambda sock, gid: False)
     with pytest.raises(RefusedError, match=f"pid {os.getpid()}.*may not use the host"):
         ask("host", Remove("alpha"))
 

@@ -1,4 +1,4 @@
-"""These tests use their own directory of sockets."""
+"""These tests use their own directory of sockets. Those with the fixture ``side`` run for both of its sides."""
 
 from __future__ import annotations
 
@@ -7,6 +7,22 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
+
+from skyloop.transport.local.system import FAST, PORTABLE, TRANSPORT_VARIABLE
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "side" in metafunc.fixturenames:
+        only = metafunc.definition.get_closest_marker("side")
+        metafunc.parametrize("side", only.args if only is not None else (FAST, PORTABLE), indirect=True)
+
+
+@pytest.fixture
+def side(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Choose the side of servers."""
+    chosen: str = request.param
+    monkeypatch.setenv(TRANSPORT_VARIABLE, "auto" if chosen == FAST else chosen)
+    return chosen
 
 
 @pytest.fixture(autouse=True)

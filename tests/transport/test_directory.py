@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import grp
 import os
+import socket
 import stat
+import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UnsupportedError, UsageError
-from skyloop.transport import local
-from skyloop.transport.local import LocalServer, dial, list_names
+from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UsageError
+from skyloop.transport.local import LocalServer, dial, list_names, names_of_others
 from skyloop.transport.local.directory import directory_owner, find_directory, of_others
-from skyloop.transport.local.sockets import Socket, user_name
+from skyloop.transport.local.fast import Socket
+from skyloop.transport.local.system import FAST, PORTABLE, serving_side, systems, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
+
+pytestmark = pytest.mark.usefixtures("side")
+
+
+@pytest.fixture
+def suffix(side: str) -> str:
+    return ".sock" if side == FAST else ".port"
 
 
 @pytest.mark.parametrize("name", ["", "Alpha", "-a", ".a", "a/b", "a" * 49, "a b", "ä", "a\n"])
@@ -26,7 +36,7 @@ def test_invalid_names_are_refused(name: str) -> None:
         dial(name)
 
 
-def test_running_proxies_are_listed(runtime_dir: Path) -> None:
+def test_running_proxies_are_listed(runtime_dir: Path, suffix: str) -> None:
     assert list_names() == []
     servers = [LocalServer(name) for name in ("bravo", "alpha", "a" * 48)]
     logs = [ServerLog() for _ in servers]
@@ -36,7 +46,7 @@ def test_running_proxies_are_listed(runtime_dir: Path) -> None:
         found = list_names()
         assert [proxy.name for proxy in found] == ["a" * 48, "alpha", "bravo"]
         assert {proxy.pid for proxy in found} == {os.getpid()}
-        assert found[1].path == runtime_dir / "alpha.sock"
+        assert found[1].path == runtime_dir / f"alpha{suffix}"
     finally:
         for server in servers:
             server.stop()
@@ -45,12 +55,12 @@ def test_running_proxies_are_listed(runtime_dir: Path) -> None:
     assert [log.joined for log in logs] == [[], [], []], "listing does not connect"
 
 
-def test_only_the_owner_may_enter(runtime_dir: Path) -> None:
+def test_only_the_owner_may_enter(runtime_dir: Path, suffix: str) -> None:
     server = LocalServer("alpha")
     server.start(ServerLog())
     try:
         assert stat.S_IMODE(runtime_dir.stat().st_mode) == 0o700
-        assert stat.S_IMODE((runtime_dir / "alpha.sock").stat().st_mode) == 0o600
+        assert stat.S_IMODE((runtime_dir / f"alpha{suffix}").stat().st_mode) == 0o600
     finally:
         server.stop()
 
@@ -91,6 +101,7 @@ def test_a_file_in_place_of_the_directory_is_refused(runtime_dir: Path) -> None:
         LocalServer("alpha").start(ServerLog())
 
 
+@pytest.mark.side(FAST)
 def test_a_group_may_share_the_directory(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     group = grp.getgrgid(os.getegid())
     server = LocalServer("alpha", group=group.gr_name)
@@ -122,6 +133,7 @@ def test_the_default_is_the_users_runtime_directory(monkeypatch: pytest.MonkeyPa
     assert find_directory().path.name == "skyloop"
 
 
+@pytest.mark.side(FAST)
 def test_a_path_too_long_for_a_socket_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/tmp/" + "x" * 100)
     with pytest.raises(UsageError, match="over the limit of 107"):
@@ -153,9 +165,14 @@ def test_an_unknown_name_gets_a_suggestion() -> None:
         server.stop()
 
 
-def leave_stale_socket(runtime_dir: Path) -> Path:
-    """Leave a socket as a killed proxy does."""
+def leave_stale_file(runtime_dir: Path, side: str) -> Path:
+    """Leave a file as a killed proxy does."""
     find_directory().create()
+    if side == PORTABLE:
+        code = "import os, sys; from skyloop.transport.local.directory import find_directory as find\n"
+        code += "listener = find().listen('alpha'); os._exit(0)"
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return runtime_dir / "alpha.port"
     path = runtime_dir / "alpha.sock"
     dead = Socket()
     dead.bind(str(path))
@@ -165,13 +182,13 @@ def leave_stale_socket(runtime_dir: Path) -> Path:
     return path
 
 
-def test_a_stale_socket_is_refused_unlisted_and_replaced(runtime_dir: Path) -> None:
-    path = leave_stale_socket(runtime_dir)
+def test_a_stale_file_is_refused_unlisted_and_replaced(runtime_dir: Path, side: str) -> None:
+    path = leave_stale_file(runtime_dir, side)
     with pytest.raises(LinkError, match="'alpha' is not running: it was killed"):
         dial("alpha")(ClientLog())
     assert list_names() == []
     assert not path.exists()
-    leave_stale_socket(runtime_dir)
+    leave_stale_file(runtime_dir, side)
     server, log = LocalServer("alpha"), ServerLog()
     server.start(log)
     client = dial("alpha")(ClientLog())
@@ -181,10 +198,10 @@ def test_a_stale_socket_is_refused_unlisted_and_replaced(runtime_dir: Path) -> N
     assert list(runtime_dir.iterdir()) == []
 
 
-def test_stopping_leaves_the_socket_of_a_successor(runtime_dir: Path) -> None:
+def test_stopping_leaves_the_file_of_a_successor(runtime_dir: Path, suffix: str) -> None:
     first, second = LocalServer("alpha"), LocalServer("alpha")
     first.start(ServerLog())
-    (runtime_dir / "alpha.sock").unlink()
+    (runtime_dir / f"alpha{suffix}").unlink()
     second.start(ServerLog())
     try:
         first.stop()
@@ -202,12 +219,53 @@ def test_a_server_end_is_started_once() -> None:
     server.stop()
 
 
-def test_other_platforms_are_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert list_names() == [], "no proxy can run there"
-    for use in (lambda: dial("alpha"), lambda: local.LocalServer):
-        with pytest.raises(UnsupportedError, match=r"needs Linux .*over the network"):
-            use()
+@pytest.mark.side(FAST)
+@pytest.mark.parametrize("missing", [(socket, "SOCK_SEQPACKET"), (socket, "SCM_RIGHTS"), (os, "memfd_create")])
+def test_a_system_without_the_fast_sides_functions_uses_the_portable_side(
+    monkeypatch: pytest.MonkeyPatch, missing: tuple[object, str]
+) -> None:
+    monkeypatch.delattr(*missing)
+    systems.cache_clear()
+    try:
+        assert list(systems()) == [PORTABLE]
+        check_that_both_sides_meet()
+    finally:
+        systems.cache_clear()
+
+
+def test_an_unknown_side_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_TRANSPORT", "tcp")
+    with pytest.raises(UsageError, match="SKYLOOP_TRANSPORT is 'tcp'; it must be 'portable', or 'auto'"):
+        LocalServer("alpha")
+    assert list_names() == [], "clients reach both sides"
+
+
+@pytest.mark.parametrize("clients", ["auto", PORTABLE])
+def test_clients_find_servers_of_both_sides(monkeypatch: pytest.MonkeyPatch, side: str, clients: str) -> None:
+    assert serving_side() == side
+    check_that_both_sides_meet(lambda: monkeypatch.setenv("SKYLOOP_TRANSPORT", clients))
+
+
+def check_that_both_sides_meet(change: Callable[[], object] = lambda: None) -> None:
+    server, log, there = LocalServer("alpha"), ServerLog(), ClientLog()
+    server.start(log)
+    change()
+    client = dial("alpha")(there)
+    wait_until(lambda: log.joined, "it joined")
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    assert list(find_directory().running()) == ["alpha"]
+    with pytest.raises(NameTakenError, match=rf"in use by a running proxy .pid {os.getpid()}."):
+        LocalServer("alpha").start(ServerLog())
+    client.close()
+    server.stop()
+    assert list_names() == []
+
+
+def test_a_file_of_the_other_side_is_replaced(runtime_dir: Path, side: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = leave_stale_file(runtime_dir, side)
+    monkeypatch.setenv("SKYLOOP_TRANSPORT", "auto" if side == PORTABLE else PORTABLE)
+    check_that_both_sides_meet()
+    assert not path.exists()
 
 
 def test_proxies_of_other_users_are_known_by_name_but_unreachable() -> None:
@@ -226,4 +284,5 @@ def test_proxies_of_other_users_are_known_by_name_but_unreachable() -> None:
 """
     owners = {Path(f"/run/user/{number}/skyloop"): number for number in (own, own + 1)}
     assert of_others(table, owners.get) == {user_name(own + 1): ["alpha", "beta"]}
+    assert isinstance(names_of_others(), dict)
     assert directory_owner(Path("/proc/self/no/such")) == Path("/proc/self").stat().st_uid

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import itertools
 
+import pytest
+
 from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.local import LocalServer, dial
 
+pytestmark = pytest.mark.usefixtures("side")
 _names = (f"suite-{number}" for number in itertools.count())
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.transport.local import packets
+from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.frame_exchange import MAX_LEASES, FrameExchange
 from skyloop.transport.testing import header, picture
 
@@ -37,13 +38,13 @@ class FakeConnection:
         return [message for message in self.messages if isinstance(message, packets.Frame)]
 
     @property
-    def slots(self) -> list[packets.Slot]:
-        return [message for message in self.messages if isinstance(message, packets.Slot)]
+    def slots(self) -> list[packets.Slot | packets.NamedSlot]:
+        return [message for message in self.messages if isinstance(message, (packets.Slot, packets.NamedSlot))]
 
 
 @pytest.fixture
-def exchange() -> FrameExchange:
-    return FrameExchange()
+def exchange(side: str) -> FrameExchange:
+    return FrameExchange(find_directory().serving.new_slot)
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def viewer(exchange: FrameExchange) -> FakeConnection:
 def memory_is_given_back(exchange: FrameExchange) -> Iterator[None]:
     before = shared_bytes()
     yield
-    exchange.__init__()  # type: ignore[misc]
+    exchange.__init__(find_directory().serving.new_slot)  # type: ignore[misc]
     gc.collect()
     assert shared_bytes() == before
 
@@ -66,7 +67,7 @@ def shared_bytes() -> int:
     """Return the size of this process's mapped shared memory [bytes]."""
     total = 0
     for line in Path("/proc/self/maps").read_text().splitlines():
-        if "/memfd:skyloop" in line:
+        if "/memfd:skyloop" in line or "/dev/shm/sky-" in line:
             start, end = line.split()[0].split("-")
             total += int(end, 16) - int(start, 16)
     return total

@@ -20,16 +20,30 @@ from skyloop.messages.codec import HEADER
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, TransportClient
 from skyloop.transport.local import LocalServer, dial, packets
 from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.fast import SealedSlot, Socket
 from skyloop.transport.local.frame_exchange import SlotMemory
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.local.system import FAST, PORTABLE, PacketSocket
 from skyloop.transport.testing import ClientLog, ServerLog, header, wait_until
+
+pytestmark = pytest.mark.usefixtures("side")
 
 
 def descriptors() -> int:
     return len(list(Path("/proc/self/fd").iterdir()))
 
 
-def send_with(sock: socket.socket, packet: bytes, *fds: int) -> None:
+def announce(raw: PacketSocket, slot: SlotMemory) -> None:
+    """Send a slot's announcement, as a server does."""
+
+    class Announcing:
+        transmit = staticmethod(raw.post)
+        transmit_descriptor = staticmethod(raw.send_descriptor)
+
+    slot.announce(Announcing(), 1)
+
+
+def send_with(sock: PacketSocket, packet: bytes, *fds: int) -> None:
+    assert isinstance(sock, Socket)
     sock.sendmsg([packet], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))])
 
 
@@ -37,19 +51,17 @@ def send_with(sock: socket.socket, packet: bytes, *fds: int) -> None:
 
 
 @contextmanager
-def raw_client(*first: bytes) -> Iterator[tuple[Socket, ServerLog, ClientLog]]:
+def raw_client(*first: bytes) -> Iterator[tuple[PacketSocket, ServerLog, ClientLog]]:
     """Open a bare connection to a server, beside a good client that must survive it."""
     server, log, good_log = LocalServer("alpha"), ServerLog(), ClientLog()
     server.start(log)
     good = dial("alpha")(good_log)
     wait_until(lambda: log.joined, "the good client joined")
-    raw = Socket()
-    raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
-    raw.settimeout(5)
-    raw.connect(str(find_directory().path / "alpha.sock"))
+    raw = find_directory().connect("alpha")
+    raw.limit_wait(5)
     try:
         for packet in first:
-            raw.send(packet)
+            raw.send_within(packet, 5)
         yield raw, log, good_log
         assert good.send(b"undisturbed")
         wait_until(lambda: log.from_peer(log.joined[0]) == [b"undisturbed"], "the good client is served")
@@ -152,8 +164,10 @@ def test_a_camera_without_readers_leaves_nothing() -> None:
         assert server._exchange._cameras == {}
 
 
+@pytest.mark.side(FAST)
 def test_descriptors_sent_to_a_server_are_not_kept() -> None:
     with raw_client(packets.hello()) as (raw, log, _):
+        assert isinstance(raw, Socket)
         wait_until(lambda: len(log.joined) == 2, "it joined")
         before = descriptors()
         for _ in range(20):
@@ -178,6 +192,7 @@ def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(log.joined) == 2
 
 
+@pytest.mark.side(FAST)
 def test_a_server_out_of_descriptors_accepts_once_there_are_some() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     server, log = LocalServer("alpha"), ServerLog()
@@ -205,7 +220,7 @@ def test_a_server_out_of_descriptors_accepts_once_there_are_some() -> None:
 
 
 @contextmanager
-def raw_server() -> Iterator[tuple[socket.socket, TransportClient, ClientLog]]:
+def raw_server() -> Iterator[tuple[PacketSocket, TransportClient, ClientLog]]:
     """Open the bare server end of a client's connection."""
     listener, _ = find_directory().listen("alpha")
     log = ClientLog()
@@ -218,9 +233,37 @@ def raw_server() -> Iterator[tuple[socket.socket, TransportClient, ClientLog]]:
     finally:
         client.close()
         accepted.close()
-        listener.close()
+        listener.hang_up()
+        del listener
     assert len(log.closings) == 1
     assert descriptors() <= before
+
+
+@pytest.mark.side(PORTABLE)
+@pytest.mark.parametrize(
+    ("number", "capacity", "complaint"),
+    [(2, 4096, "not the proxy's slot 2"), (1, 2048, "not the proxy's slot 1"), (1, 8192, "can't be mapped")],
+)
+def test_memory_that_is_not_the_announced_one_is_refused(number: int, capacity: int, complaint: str) -> None:
+    slot = find_directory().serving.new_slot(1, 0, 4096)
+    name = slot._name  # type: ignore[attr-defined]
+    with raw_server() as (raw, _, log):
+        raw.send(packets.named_slot(number, 1, capacity, name))
+        raw.send(packets.frame(number, encode(header(1, 8, 8))))
+        wait_until(lambda: log.closings, "the client refused it")
+        assert complaint in log.closings[0]
+        assert log.frames == []
+
+
+@pytest.mark.side(PORTABLE)
+def test_memory_that_does_not_exist_is_refused_when_it_is_needed() -> None:
+    with raw_server() as (raw, _, log):
+        raw.send(packets.named_slot(1, 1, 4096, "sky-000000000000-0"))
+        raw.send(b"a sample")  # the server may have freed a slot that it announced and did not use
+        wait_until(lambda: log.packets, "the connection goes on")
+        raw.send(packets.frame(1, encode(header(1))))
+        wait_until(lambda: log.closings, "the client refused it")
+        assert "can't be mapped: [Errno 2]" in log.closings[0]
 
 
 def memfd(size: int, seals: int) -> int:
@@ -230,6 +273,7 @@ def memfd(size: int, seals: int) -> int:
     return fd
 
 
+@pytest.mark.side(FAST)
 @pytest.mark.parametrize(
     ("size", "seals", "capacity", "complaint"),
     [
@@ -251,6 +295,7 @@ def test_memory_that_could_vanish_is_refused(size: int, seals: int, capacity: in
         os.close(fd)
 
 
+@pytest.mark.side(FAST)
 def test_an_ordinary_file_is_refused() -> None:
     with tempfile.TemporaryFile() as file:
         file.truncate(8192)
@@ -260,6 +305,7 @@ def test_an_ordinary_file_is_refused() -> None:
             assert "not sealed" in log.closings[0]
 
 
+@pytest.mark.side(FAST)
 @pytest.mark.parametrize("count", [0, 2, 4])
 def test_a_slot_needs_one_descriptor(count: int) -> None:
     with raw_server() as (raw, _, log):
@@ -268,6 +314,7 @@ def test_a_slot_needs_one_descriptor(count: int) -> None:
         assert f"with {count} descriptors" in log.closings[0]
 
 
+@pytest.mark.side(FAST)
 @pytest.mark.parametrize("packet", [b"a sample", packets.bye("x"), packets.frame(1, encode(header(1)))])
 def test_descriptors_out_of_place_are_closed(packet: bytes) -> None:
     with raw_server() as (raw, _, _):
@@ -288,9 +335,9 @@ def test_descriptors_out_of_place_are_closed(packet: bytes) -> None:
     ],
 )
 def test_frames_without_memory_are_refused(packet: bytes, complaint: str) -> None:
-    slot = SlotMemory(1, 0, 4096)
+    slot = find_directory().serving.new_slot(1, 0, 4096)
     with raw_server() as (raw, _, log):
-        send_with(raw, packets.slot(1, 1, 4096), slot.fd)
+        announce(raw, slot)
         raw.send(packet)
         wait_until(lambda: log.closings, "the client refused it")
         assert complaint in log.closings[0]
@@ -298,19 +345,23 @@ def test_frames_without_memory_are_refused(packet: bytes, complaint: str) -> Non
 
 
 def test_the_memory_is_read_only_for_a_client() -> None:
-    slot = SlotMemory(1, 0, 4096)
+    slot = find_directory().serving.new_slot(1, 0, 4096)
     slot.array[:] = 7
     with raw_server() as (raw, _, log):
-        send_with(raw, packets.slot(1, 1, 4096), slot.fd)
+        announce(raw, slot)
         raw.send(packets.frame(1, encode(header(1))))
         wait_until(lambda: log.frames, "the frame arrived")
         pixels = log.frames[0][1]
         with pytest.raises(ValueError, match="WRITEABLE"):
             pixels.flags.writeable = True
-        with pytest.raises(PermissionError):
-            os.pwrite(slot.fd, b"x", 0)
-        with pytest.raises(PermissionError):
-            os.ftruncate(slot.fd, 0)
+        if isinstance(slot, SealedSlot):
+            with pytest.raises(PermissionError):
+                os.pwrite(slot.fd, b"x", 0)
+            with pytest.raises(PermissionError):
+                os.ftruncate(slot.fd, 0)
+        address = f"{pixels.ctypes.data & ~0xFFF:x}-"
+        mapping = next(line for line in Path("/proc/self/maps").read_text().splitlines() if line.startswith(address))
+        assert mapping.split()[1] == "r--s"
         assert np.all(pixels == 7)
 
 
@@ -334,7 +385,7 @@ def test_packets_that_do_not_fit_are_sent_later_and_in_order() -> None:
         wishes = [(f"topic-{number}", True) for number in range(5)] + [("topic-1", False)]
         for wish in wishes:
             client.subscribe(*wish)
-        raw.settimeout(5)
+        raw.limit_wait(5)
         received = [raw.recv(60_000) for _ in range(sent + len(wishes))]
         assert [packets.parse(packet) for packet in received[sent:]] == [packets.Subscribe(*wish) for wish in wishes]
         assert log.closings == []

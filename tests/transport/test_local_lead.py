@@ -17,6 +17,7 @@ from skyloop.transport.local import LocalServer, dial
 from skyloop.transport.local.client import LocalClient
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
+pytestmark = pytest.mark.usefixtures("side")
 _names = (f"lead-{number}" for number in itertools.count())
 
 

@@ -22,10 +22,11 @@ from skyloop.errors import LinkError
 from skyloop.transport.base import FEEDBACK, video
 from skyloop.transport.local import LocalServer, dial, list_names, packets
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.sockets import Socket
+from skyloop.transport.local.fast import Socket
+from skyloop.transport.local.system import FAST
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.usefixtures("side")]
 
 
 @contextmanager
@@ -60,7 +61,7 @@ def serving() -> Iterator[tuple[LocalServer, ServerLog]]:
         server.stop()
 
 
-def test_a_killed_proxy_is_noticed_at_once_and_its_name_is_free(runtime_dir: Path) -> None:
+def test_a_killed_proxy_is_noticed_at_once_and_its_name_is_free(runtime_dir: Path, side: str) -> None:
     log = ClientLog(keep=False)
     with process("serve") as child:
         client = dial("alpha")(log)
@@ -76,7 +77,8 @@ def test_a_killed_proxy_is_noticed_at_once_and_its_name_is_free(runtime_dir: Pat
         assert log.torn == []
         assert not client.send(b"x")
         client.close()
-    assert [path.name for path in runtime_dir.iterdir()] == ["alpha.sock"], "one stale socket, and nothing else"
+    left = ["alpha.sock" if side == FAST else "alpha.port"]
+    assert [path.name for path in runtime_dir.iterdir()] == left, "one stale file, and nothing else"
     with pytest.raises(LinkError, match="it was killed"):
         dial("alpha")(log)
     with serving() as (_, server_log):
@@ -137,6 +139,7 @@ def test_a_stopped_observer_delays_no_one_and_resumes_with_the_newest() -> None:
         client.close()
 
 
+@pytest.mark.side(FAST)
 def test_a_proxy_that_does_not_accept_does_not_block_a_caller() -> None:
     directory = find_directory()
     directory.create()
@@ -193,12 +196,12 @@ def come_and_go(log: ServerLog, rng: random.Random) -> None:
             wait_until(lambda: len(log.joined) > known, "it joined")
         client.close()
     else:  # without a goodbye, and with unread packets
-        with Socket() as raw:
-            raw.connect(str(find_directory().path / "alpha.sock"))
-            raw.send(packets.hello())
-            raw.send(packets.subscribe(video(FRONT), True))
-            if rng.random() < 0.5:
-                raw.send(rng.randbytes(50))
+        raw = find_directory().connect("alpha")
+        raw.send(packets.hello())
+        raw.send(packets.subscribe(video(FRONT), True))
+        if rng.random() < 0.5:
+            raw.send(rng.randbytes(50))
+        raw.close()
     wait_until(lambda: len(log.joined) > known, "it joined")
 
 
@@ -210,7 +213,8 @@ def resources() -> Counter[str]:
             held[str(path.readlink()).split(":")[0]] += 1
         except FileNotFoundError:
             continue
-    held["mapping"] = Path("/proc/self/maps").read_text().count("memfd:skyloop")
+    maps = Path("/proc/self/maps").read_text()
+    held["mapping"] = maps.count("memfd:skyloop") + maps.count("/dev/shm/sky-")
     held.update(thread.name for thread in threading.enumerate() if not thread.name.startswith("Thread-"))
     return held
 
@@ -239,6 +243,7 @@ def call_as_nobody(path: Path, *groups: int) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
 
 
+@pytest.mark.side(FAST)
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_another_user_is_rejected_even_with_access_to_the_directory(runtime_dir: Path) -> None:
     with serving() as (_, log):
@@ -251,6 +256,7 @@ def test_another_user_is_rejected_even_with_access_to_the_directory(runtime_dir:
         assert log.joined == []
 
 
+@pytest.mark.side(FAST)
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_a_member_of_the_group_is_accepted(runtime_dir: Path) -> None:
     group = next(group for group in grp.getgrall() if group.gr_gid not in (0, 65534))

@@ -18,12 +18,13 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer, Source
 from skyloop.transport.priority import Lane
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
 
+pytestmark = pytest.mark.usefixtures("side")
 _names = (f"shared-{number}" for number in itertools.count())
 
 
 class TestShared(TransportSuite):
     @pytest.fixture(autouse=True)
-    def reactor(self) -> Iterator[None]:
+    def reactor(self, side: str) -> Iterator[None]:
         self._reactor = Reactor()
         yield
         self._reactor.close()
@@ -65,7 +66,7 @@ class Served:
 
 
 @pytest.fixture
-def reactor() -> Iterator[Reactor]:
+def reactor(side: str) -> Iterator[Reactor]:
     made = Reactor()
     yield made
     made.close()
@@ -157,11 +158,11 @@ def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor)
 
 
 def test_a_silent_connection_is_closed(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
-    from skyloop.transport.local.directory import connect, find_directory
+    from skyloop.transport.local.directory import find_directory
 
     monkeypatch.setattr("skyloop.transport.local.reactor.HELLO_S", 0.05)
     server = Served(reactor)
-    silent = connect(find_directory().socket_path(server.name))
+    silent = find_directory().connect(server.name)
     assert b"no Hello" in silent.recv(1000)
     assert silent.recv(1000) == b""
     assert server.client.send(b"here")

@@ -20,6 +20,7 @@ from tests.support.proxy_bench import Bench
 
 FLY, LAND = Velocity(forward=1.0), Land()
 BLOCK = encode(Request(1, Ping(1)))
+pytestmark = pytest.mark.usefixtures("side")
 _names = (f"late-{number}" for number in itertools.count())
 
 
@@ -28,7 +29,7 @@ def command(seq: int, action: AnyAction) -> bytes:
 
 
 @pytest.fixture
-def reactor() -> Iterator[Reactor]:
+def reactor(side: str) -> Iterator[Reactor]:
     made = Reactor()
     yield made
     made.close()

@@ -86,7 +86,8 @@ def delay_table(results: DelayResults) -> Table:
         for row in results.rows
     ]
     columns = ("", "Skyloop", "bare hand-over", "ratio", "samples", "lost")
-    return _table("Delays in µs: median (99th percentile)", columns, rows, str(results.machine))
+    title = f"Delays in µs over the {results.transport} local transport: median (99th percentile)"
+    return _table(title, columns, rows, str(results.machine))
 
 
 def physics_table(results: SimResults) -> Table:

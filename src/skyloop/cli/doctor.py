@@ -142,25 +142,10 @@ def _python() -> Iterator[Finding]:
 
 
 def _local_transport() -> Iterator[Finding]:
-    if sys.platform != "linux":
-        yield Finding(
-            "local transport",
-            Health.BAD,
-            f"needs Linux, but this is {platform.system()}",
-            "run proxies on Linux; programs elsewhere reach them over the network: SKYLOOP_NETWORK=multicast",
-        )
-        return
     from skyloop.transport.local.directory import DIRECTORY_VARIABLE, find_directory
+    from skyloop.transport.local.system import FAST, serving_side
 
-    try:
-        os.close(os.memfd_create("skyloop-doctor", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
-        for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET):
-            end.close()
-    except OSError as error:
-        yield Finding(
-            "local transport", Health.BAD, f"this system refuses it: {error}", "allow memfd_create and Unix sockets"
-        )
-        return
+    side = serving_side()
     directory = find_directory()
     try:
         directory.create()
@@ -168,7 +153,8 @@ def _local_transport() -> Iterator[Finding]:
         detail = f"{directory.path} can't be created: {error.strerror}"
         yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory that you own")
     else:
-        yield Finding("local transport", Health.GOOD, f"sockets in {directory.path}")
+        what = "sockets" if side == FAST else f"{side}: loopback TCP and named memory, registrations"
+        yield Finding("local transport", Health.GOOD, f"{what} in {directory.path}")
 
 
 def _import_time() -> Iterator[Finding]:

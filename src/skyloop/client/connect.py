@@ -323,17 +323,14 @@ def _network() -> NetworkTransport:
 def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     """Return a dialer for the proxy with this name.
 
-    Each call prefers a proxy on this host if the local transport (Linux only) is available. The dialer raises
-    :class:`LinkError`, or :class:`UnknownNameError`, whose text lists where it searched. This function raises
-    :class:`UsageError` if ``name`` is not a valid name.
+    Each call prefers a proxy on this host. The dialer raises :class:`LinkError`, or :class:`UnknownNameError`, which
+    lists where it searched. This function raises :class:`UsageError` if ``name`` is not a valid name.
     """
     check_name(name)
     settings = network_settings(network)
     if settings is None:
         return _hinting(_local(name))
     far = _network().dial(name, settings)
-    if sys.platform != "linux":
-        return far
     near = _local(name)
 
     def dialer(handler: ClientHandler) -> TransportClient:

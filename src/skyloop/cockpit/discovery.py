@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import threading
 from collections.abc import Collection
 from pathlib import Path
@@ -53,21 +51,12 @@ class LocalFinder:
         """Do nothing: each search closes what it opens."""
 
     def __call__(self) -> list[Found]:
-        if sys.platform != "linux":  # proxies run on Linux only
-            return []
-        from skyloop.transport.base import NAME
         from skyloop.transport.local import dial
-        from skyloop.transport.local.directory import find_directory, is_live
+        from skyloop.transport.local.directory import find_directory
 
-        folder = find_directory().path
-        try:
-            files = sorted(entry.path for entry in os.scandir(folder))
-        except FileNotFoundError:
-            return []
         found = []
-        for path in map(Path, files):
-            name = path.stem
-            if path.suffix == ".sock" and NAME.fullmatch(name) and self._wanted(name) and is_live(path):
+        for name, path in find_directory().running().items():
+            if self._wanted(name):
                 found.append(self._known.setdefault((name, path), Found(name, "local", dial(name))))
         return found
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import logging
 import os
-import socket
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -37,8 +36,8 @@ from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, announce, on_signals
 from skyloop.toml_file import Place
-from skyloop.transport.local.directory import HOST, connect, find_directory
-from skyloop.transport.local.sockets import Socket, credentials, may_connect, set_timeout
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.system import HOST, Listener, PacketSocket, StrangerError
 
 _POLL_S: Final = 0.2  # interval between checks for signals and updates
 MAX_REQUEST: Final = 1 << 22  #: maximum size in bytes, sent in packets of ``_CHUNK``
@@ -208,7 +207,7 @@ class ControlServer:
         self._answering = answering
         self._directory = find_directory(group, HOST)
         self._directory.socket_path(name)
-        self._listener: Socket | None = None
+        self._listener: Listener | None = None
         self._inode = 0
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
@@ -230,23 +229,24 @@ class ControlServer:
         self._thread.join()
         self._directory.remove(self._name, self._inode)
 
-    def _run(self, listener: Socket) -> None:
+    def _run(self, listener: Listener) -> None:
         while self._listener is not None:
             try:
-                accepted, _ = listener.accept()
+                sock, _ = listener.accept()
+            except StrangerError as error:
+                _log.warning("%s", error)
+                continue
             except OSError:  # closing, the caller is gone, or no descriptors are left: pause before trying again
                 self._ended.wait(_AGAIN_S)
                 continue
-            sock = Socket(accepted.detach())
             try:
                 threading.Thread(target=self._serve, args=(sock,), name="skyloop-host-request", daemon=True).start()
             except RuntimeError as error:  # no thread is currently available
                 _log.warning("a request was not answered: %s", error)
                 sock.hang_up()
 
-    def _serve(self, sock: Socket) -> None:
-        set_timeout(sock, socket.SO_RCVTIMEO, _SLOW_S)
-        set_timeout(sock, socket.SO_SNDTIMEO, _SLOW_S)
+    def _serve(self, sock: PacketSocket) -> None:
+        sock.limit_wait(_SLOW_S)
         try:
             if (answer := self._answer(sock)) is not None:
                 _send(sock, msgspec.json.encode(answer))
@@ -254,10 +254,10 @@ class ControlServer:
             _log.info("an answer was not received: %s", error)
         sock.hang_up()
 
-    def _answer(self, sock: Socket) -> Answer | None:
+    def _answer(self, sock: PacketSocket) -> Answer | None:
         """Return the answer to a request; None if a client only checked whether a host exists."""
-        if not may_connect(sock, self._directory.gid):
-            return Answer(error=f"{credentials(sock)} may not use the host {self._name!r}", kind="RefusedError")
+        if not self._directory.serving.may_connect(sock, self._directory.gid):
+            return Answer(error=f"{sock.who} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
         while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
             received += packet
@@ -285,10 +285,10 @@ class ControlServer:
             return Answer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
 
 
-def _send(sock: Socket, text: bytes) -> None:
+def _send(sock: PacketSocket, text: bytes) -> None:
     """Send a request or an answer, split into as many packets as needed."""
     for first in range(0, len(text), _CHUNK):
-        sock.send(text[first : first + _CHUNK], socket.MSG_NOSIGNAL)
+        sock.send_within(text[first : first + _CHUNK], _SLOW_S)
 
 
 def running_hosts(group: str | None = None) -> list[str]:
@@ -314,11 +314,10 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     """Send a request to a host. Return or raise its answer, or raise :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:
-        directory.check()
-        sock = connect(directory.socket_path(name))
+        sock = directory.connect(name)
     except OSError as error:
         raise LinkError(f"the host {name!r} can't be reached: {error.strerror}") from None
-    set_timeout(sock, socket.SO_RCVTIMEO, ANSWERS_WITHIN_S)
+    sock.limit_wait(ANSWERS_WITHIN_S)
     received = bytearray()
     try:
         with suppress(BrokenPipeError):  # a caller that is refused gets its answer before it has sent its whole request

@@ -1,4 +1,4 @@
-"""Without a local transport, programs and the page reach drones on the network (docs/platforms.md).
+"""Without Linux's own functions, programs and the page reach drones on the host and the network (docs/platforms.md).
 
 As on Windows, which lacks more than macOS does; ``other_platform.py`` says what that shows.
 """
@@ -48,6 +48,17 @@ def test_programs_and_the_page_reach_drones_on_the_network(start: Callable[..., 
     with urllib.request.urlopen(urllib.request.Request(f"{address}api/login", body, headers)) as answer:
         assert json.load(answer)["role"] == "observer"
 
-    no_proxy = start(*there, "proxy", "sim://")
-    no_proxy.until("the local transport needs Linux", 60)
-    assert no_proxy.wait() == 1
+
+@pytest.mark.parametrize("platform", ["win32", "darwin"])
+def test_programs_reach_drones_on_their_own_host(start: Callable[..., Process], platform: str) -> None:
+    """Over the portable side of the local transport, frames included."""
+    there = ("-m", "tests.integration.processes.other_platform", platform)
+    start(*there, "proxy", "sim://?world=empty&cameras=front&speed=3", "--name", "bravo").until("ready", 60)
+    flight = start(*there, "fly", "bravo", "")
+    flight.until("flew, and saw (240, 320, 3)", 60)
+    assert flight.wait() == 0
+    listing = start(*there, "list")
+    listing.until("bravo", 60)
+    assert listing.wait() == 0
+    for left in Path("/dev/shm").glob("as-on-windows-*"):  # Windows would free it
+        left.unlink()

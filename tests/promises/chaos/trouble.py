@@ -19,7 +19,8 @@ from skyloop.host.vehicle import Condition
 from skyloop.messages import Hello, ListParameters, Ping, Request, Role, encode
 from skyloop.network.config import free_port
 from skyloop.transport.local import packets
-from skyloop.transport.local.directory import PROXY, find_directory
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.system import PROXY
 
 CONNECTIONS: Final = 40
 BURSTS_PER_S: Final = 50.0

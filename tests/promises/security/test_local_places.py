@@ -18,13 +18,15 @@ from skyloop.errors import LinkError
 from skyloop.messages import EventKind, Hello, Refusal, Refused, Role, Welcome
 from skyloop.proxy.requests import HELLO_NS
 from skyloop.transport.local import LocalServer, dial, list_names
-from skyloop.transport.local.directory import connect, find_directory
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.fast import Socket, connect
 from skyloop.transport.local.packets import Bye, hello, parse
-from skyloop.transport.local.sockets import Credentials, Socket
+from skyloop.transport.local.system import Credentials
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 from tests.support.proxy_bench import WAIT_S, Bench
 
 SERVER = "skyloop.transport.local.server"
+SOCKETS = "skyloop.transport.local.fast"
 
 
 class Place:
@@ -120,7 +122,7 @@ def test_one_process_does_not_get_all_places(place: Place, monkeypatch: pytest.M
         assert place.admitted(pilot=True) == ""
     assert f"pid {os.getpid()} has 3 connections to local:alpha" in word(place.raw())
     code = "import sys; from skyloop.transport.local import directory as d, packets\n"
-    code += "s = d.connect(d.find_directory().path / 'alpha.sock'); s.send(packets.hello()); sys.stdin.read()"
+    code += "s = d.find_directory().connect('alpha'); s.send(packets.hello()); sys.stdin.read()"
     other = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
     try:
         wait_until(lambda: len(place.log.joined) == 4, "another process gets one")
@@ -131,13 +133,13 @@ def test_one_process_does_not_get_all_places(place: Place, monkeypatch: pytest.M
 def test_one_other_user_does_not_get_all_places(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """Members of a group are admitted; other tests show that they are."""
     monkeypatch.setattr(f"{SERVER}.MAX_PER_USER", 2)
-    monkeypatch.setattr(f"{SERVER}.may_connect", lambda *_: True)
+    monkeypatch.setattr("skyloop.transport.local.fast.may_connect", lambda *_: True)
     pids = iter(range(100, 200))
-    monkeypatch.setattr(f"{SERVER}.credentials", lambda _: Credentials(next(pids), 54321, 54321))
+    monkeypatch.setattr(f"{SOCKETS}.credentials", lambda _: Credentials(next(pids), 54321, 54321))
     for _ in range(2):
         place.admitted(pilot=True)
     assert "uid 54321 has 2 connections to local:alpha" in word(place.raw())
-    monkeypatch.setattr(f"{SERVER}.credentials", lambda _: Credentials(next(pids), os.geteuid(), 0))
+    monkeypatch.setattr(f"{SOCKETS}.credentials", lambda _: Credentials(next(pids), os.geteuid(), 0))
     assert place.admitted(pilot=True) == "", "the proxy's own user is admitted"
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import array
-import fcntl
 import logging
-import mmap
 import os
-import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -21,11 +18,11 @@ from skyloop.errors import DecodeError, LinkError
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 from skyloop.transport.base import MAX_PACKET, ClientHandler, Pixels, TransportClient, check_packet, check_topic
 from skyloop.transport.local import packets
+from skyloop.transport.local.named_memory import map_named
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
+from skyloop.transport.local.system import SEND_FLAGS, PacketSocket
 
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet is slightly larger than its header's packet
-_ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # interval between retries for packets that did not fit into a full socket
 _CHECK_S: Final = 0.05  # interval at which a leading thread checks whether its wait is over if nothing arrives
 _STAND_BY_S: Final = 0.002  # how long no other thread receives after the leading thread has returned with its sample
@@ -41,11 +38,11 @@ class LocalClient(TransportClient):
     # packet to another thread takes a second wake-up, which costs as much as the whole path from the proxy. While a
     # thread leads, the receiving thread stands by. It takes over once no thread has received for two milliseconds.
 
-    def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
-        self._address = f"local:{name} (pid {credentials(sock).pid})"
+    def __init__(self, sock: PacketSocket, name: str, handler: ClientHandler) -> None:
+        self._address = f"local:{name} (pid {sock.who.pid})"
         sock.limit_backlog()
-        set_timeout(sock, socket.SO_RCVTIMEO, _RETRY_S)
-        self._socket: Socket | None = sock
+        sock.limit_wait(_RETRY_S)
+        self._socket: PacketSocket | None = sock
         self._handler = handler
         self._unsent: deque[bytes] = deque()  # the transport's own packets that did not fit, in order
         self._leases = Leases(self._release)
@@ -140,7 +137,7 @@ class LocalClient(TransportClient):
             return
         if not self._unsent:
             try:
-                sock.send(packet, SEND_FLAGS)
+                sock.post(packet)
             except BlockingIOError:
                 pass
             except OSError:
@@ -151,14 +148,14 @@ class LocalClient(TransportClient):
 
     # --- on the receiving thread ---
 
-    def _run(self, sock: Socket) -> None:
+    def _run(self, sock: PacketSocket) -> None:
         while not self._ended:
-            set_timeout(sock, socket.SO_RCVTIMEO, _RETRY_S)
+            sock.limit_wait(_RETRY_S)
             with self._turn:
                 self._take_turn(sock, lambda: self._candidate is not None)
             wake, self._candidate = self._candidate, None
             if wake is not None and not self._ended:
-                set_timeout(sock, socket.SO_RCVTIMEO, _CHECK_S)
+                sock.limit_wait(_CHECK_S)
                 wake()
                 self._stand_by()
         reason = self._ended
@@ -182,7 +179,7 @@ class LocalClient(TransportClient):
 
     # --- on the thread that has the turn ---
 
-    def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
+    def _take_turn(self, sock: PacketSocket, over: Callable[[], bool]) -> None:
         """Deliver packets until ``over`` returns True or the connection ends.
 
         On the application's main thread, an exception raised by a signal handler during the wait propagates from here.
@@ -193,15 +190,15 @@ class LocalClient(TransportClient):
         finally:
             self._receiver = 0
 
-    def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
+    def _receive(self, sock: PacketSocket, over: Callable[[], bool]) -> str:
         """Deliver packets until ``over`` returns True or the connection ends. If it ended, return the reason."""
-        receive = sock.recvmsg
+        receive = sock.receiver(_MAX_RECEIVED)
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
             if self._releases or self._unsent:
                 self._send_waiting(sock)
             try:
-                packet, ancillary, _, _ = receive(_MAX_RECEIVED, _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
+                packet, ancillary, _, _ = receive()
             except BlockingIOError:
                 if over():
                     return ""
@@ -221,7 +218,7 @@ class LocalClient(TransportClient):
                 elif ancillary or packets.is_own(packet):
                     try:
                         if kind != packets.FRAME or ancillary:
-                            self._control(packet, _descriptors(ancillary))
+                            self._control(sock, packet, ancillary)
                             continue
                         number, header = packets.parse_frame(packet)
                         pixels = self._leases.pixels(number, header.size)
@@ -238,8 +235,9 @@ class LocalClient(TransportClient):
                 return ""
         return self._reason or "closed by the application"
 
-    def _control(self, packet: bytes, descriptors: list[int]) -> None:
+    def _control(self, sock: PacketSocket, packet: bytes, ancillary: Sequence[Any]) -> None:
         """Handle one of the transport's own packets other than a frame, and close the packet's descriptors."""
+        descriptors = sock.descriptors(ancillary)
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
@@ -247,7 +245,11 @@ class LocalClient(TransportClient):
             if isinstance(message, packets.Slot):
                 if len(descriptors) != 1:
                     raise LinkError(f"a slot was announced with {len(descriptors)} descriptors and must have one")
-                self._leases.add(message.slot, message.camera, message.capacity, descriptors[0])
+                pixels = sock.map_sealed(descriptors[0], _allowed(message.capacity))
+                self._leases.add(message.slot, message.camera, pixels)
+            elif isinstance(message, packets.NamedSlot):
+                map_it = partial(map_named, message.name, message.slot, _allowed(message.capacity))
+                self._leases.announce(message.slot, message.camera, map_it)
             elif isinstance(message, packets.Retire):
                 self._leases.retire(message.camera, message.before)
             elif isinstance(message, packets.Bye):
@@ -256,7 +258,7 @@ class LocalClient(TransportClient):
             for descriptor in descriptors:
                 os.close(descriptor)
 
-    def _send_waiting(self, sock: Socket) -> None:
+    def _send_waiting(self, sock: PacketSocket) -> None:
         """Send the releases from this turn, and the packets that did not fit into the socket earlier."""
         while self._releases:
             self._unsent.append(self._releases.popleft())
@@ -269,12 +271,11 @@ class LocalClient(TransportClient):
             return
 
 
-def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
-    descriptors = array.array("i")
-    for level, kind, data in ancillary:
-        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
-            descriptors.frombytes(data[: len(data) - len(data) % descriptors.itemsize])
-    return descriptors.tolist()
+def _allowed(capacity: int) -> int:
+    """Return a slot's capacity [bytes]. Raises :class:`LinkError` for one that is too large."""
+    if capacity > _MAX_CAPACITY:
+        raise LinkError(f"the proxy offered a slot of {capacity} bytes, but only {_MAX_CAPACITY} bytes are allowed")
+    return capacity
 
 
 class SlotView:
@@ -282,24 +283,13 @@ class SlotView:
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
-    def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
-        """Map the memory, unless it could shrink while it is read. The caller still owns ``fd``."""
+    def __init__(self, number: int, camera: int, pixels: Pixels, held: set[int]) -> None:
         self.number = number
         self.camera = camera
-        self.capacity = capacity
+        self.capacity = pixels.size
         self.held = held  #: numbers of all slots of this camera that the application holds
-        try:
-            seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
-        except OSError:
-            seals = 0
-        if not seals & fcntl.F_SEAL_SHRINK:
-            raise LinkError("the proxy offered shared memory that is not sealed against shrinking")
-        size = os.fstat(fd).st_size
-        if not 0 < capacity <= min(size, _MAX_CAPACITY):
-            raise LinkError(f"the proxy offered a slot of {capacity} bytes, but only {size} bytes of shared memory")
-        view = mmap.mmap(fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE, mmap.PROT_READ)
-        self.pixels: Pixels = np.frombuffer(view, np.uint8)
-        self._interface = self._describe(capacity)
+        self.pixels = pixels
+        self._interface = self._describe(pixels.size)
 
     def interface(self, size: int) -> dict[str, Any]:
         """Return NumPy's description of the first ``size`` bytes. It is cached until the size changes."""
@@ -335,17 +325,25 @@ class Leases:
     def __init__(self, send_release: Callable[[int], None]) -> None:
         self._send_release = send_release
         self._slots: dict[int, SlotView] = {}
+        self._unmapped: dict[int, tuple[int, Callable[[], Pixels]]] = {}
         self._held: dict[int, set[int]] = {}
 
-    def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot that the server announced. The caller still owns ``fd``."""
-        self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
+    def add(self, number: int, camera: int, pixels: Pixels) -> None:
+        """Add a slot that the server announced, as mapped."""
+        self._slots[number] = SlotView(number, camera, pixels, self._held.setdefault(camera, set()))
+
+    def announce(self, number: int, camera: int, map_it: Callable[[], Pixels]) -> None:
+        """Add a slot that is mapped with its first frame. Until then, the server may free memory that has a name."""
+        self._unmapped[number] = camera, map_it
 
     def retire(self, camera: int, before: int) -> None:
         """Forget a camera's slots with numbers below ``before``."""
         for slot in list(self._slots.values()):
             if slot.camera == camera and slot.number < before:
                 del self._slots[slot.number]
+        for number, (its_camera, _) in list(self._unmapped.items()):
+            if its_camera == camera and number < before:
+                del self._unmapped[number]
 
     def end(self) -> None:
         """Forget all slots at the end of the connection. Frames that the application still holds stay valid.
@@ -354,10 +352,14 @@ class Leases:
         here to the client, its handler and the frames that it stores would therefore keep all of them alive forever.
         """
         self._slots.clear()
+        self._unmapped.clear()
         self._send_release = lambda _: None
 
     def pixels(self, number: int, size: int) -> Pixels:
         """Return a slot's frame: in place, or as a copy if the application already holds :attr:`IN_PLACE` frames."""
+        if number in self._unmapped:
+            camera, map_it = self._unmapped.pop(number)
+            self.add(number, camera, map_it())
         slot = self._slots.get(number)
         if slot is None or not 0 <= size <= slot.capacity:
             raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")

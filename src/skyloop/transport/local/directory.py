@@ -1,25 +1,24 @@
 """The directory of sockets, where proxies are found by name, and its access rules.
 
-Each proxy has one socket, ``NAME.sock``, in a directory that only the directory's owner (or a named group) can enter.
+Each proxy has one file, ``NAME.sock`` or on the portable side ``NAME.port``, in a directory that only the directory's
+owner (or a named group) can enter.
 The variable ``SKYLOOP_RUNTIME_DIR`` sets the directory. The default is ``skyloop`` in the user's runtime directory. A
 process that changes the directory holds an advisory lock, which the kernel releases when the process ends. The lock is
 on the directory itself. If a group may read the directory, the lock is on the file ``.lock`` in it, which only the
 owner can open, so that members of the group can't block a proxy. Reading needs no lock.
 
-The socket of a killed proxy remains as a file. A connection attempt with the *wrong* type of socket reveals whether a
-process is still listening. The kernel answers at once, without the owner noticing: ``EPROTOTYPE`` for a live socket and
-``ECONNREFUSED`` for a dead one.
+On Windows, the folder in the user's own profile inherits an access list that admits only that user, administrators and
+the system. Modes, owners and groups are therefore not checked there, and the lock is always on the file ``.lock``.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
-import grp
+import functools
 import os
-import socket
 import stat
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -28,17 +27,23 @@ from typing import Final, NamedTuple
 
 from skyloop.errors import LinkError, NameTakenError, UsageError
 from skyloop.transport.base import NAME, check_name
-from skyloop.transport.local.sockets import Socket, credentials, set_timeout, user_name
+from skyloop.transport.local.system import (
+    PROXY,
+    Listener,
+    PacketSocket,
+    System,
+    own_uid,
+    serving_side,
+    systems,
+    try_lock,
+    user_name,
+)
 
 DIRECTORY_VARIABLE: Final = "SKYLOOP_RUNTIME_DIR"
 GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
-MAX_PATH: Final = 107  #: Linux's limit for a socket's path [bytes]
-LOCK_TIMEOUT_S: Final = 2.0  #: how long to wait for another process that changes the directory
-CONNECT_TIMEOUT_S: Final = 1.0  #: time limit for a proxy to accept a connection
-PROXY: Final = "proxy"
-HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
-_SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
+LOCK_TIMEOUT_S: Final = 2.0
 _LOCK: Final = ".lock"
+_SOCKET: Final = ".sock"
 _OPEN_TO_OTHERS: Final = 0o027  # file permissions: writable by the group, or any access for others
 
 
@@ -57,17 +62,18 @@ class Directory:
         self.path = path
         self.gid = gid
         self._kind = kind
-        self._suffix = _SUFFIXES[kind]
 
-    def socket_path(self, name: str) -> Path:
-        """Return the path of a proxy's socket. The path must not be longer than :data:`MAX_PATH`."""
+    @functools.cached_property
+    def serving(self) -> System:
+        """The side that a new server uses."""
+        return systems()[serving_side()]
+
+    def socket_path(self, name: str, system: System | None = None) -> Path:
+        """Return the path of a proxy's file, by default for a new server. Raises :class:`UsageError`."""
         check_name(name)
-        path = self.path / (name + self._suffix)
-        if len(os.fsencode(path)) > MAX_PATH:
-            raise UsageError(
-                f"the socket's path {path} has {len(os.fsencode(path))} bytes, over the limit of {MAX_PATH}: "
-                f"set {DIRECTORY_VARIABLE} to a shorter directory"
-            )
+        system = system or self.serving
+        path = self.path / (name + system.SUFFIXES[self._kind])
+        system.check_path(path)
         return path
 
     def create(self) -> None:
@@ -75,7 +81,7 @@ class Directory:
         self.path.parent.mkdir(mode=0o700 if self.gid is None else 0o755, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             self.path.mkdir(mode=0o700)
-        if self.gid is not None and self.path.lstat().st_uid == os.geteuid():
+        if sys.platform != "win32" and self.gid is not None and self.path.lstat().st_uid == own_uid():
             os.chown(self.path, -1, self.gid, follow_symlinks=False)
             self.path.chmod(0o750)
         self.check()
@@ -85,10 +91,12 @@ class Directory:
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
         if not stat.S_ISDIR(here.st_mode):
             raise LinkError(f"{self.path} is not a directory: remove it, or set {DIRECTORY_VARIABLE} to another one")
-        ours = here.st_uid == os.geteuid() or (self.gid is not None and here.st_gid == self.gid)
+        if sys.platform == "win32":
+            return
+        ours = here.st_uid == own_uid() or (self.gid is not None and here.st_gid == self.gid)
         if not ours:
             raise LinkError(
-                f"{self.path} belongs to {user_name(here.st_uid)} and not to {user_name(os.geteuid())}: set "
+                f"{self.path} belongs to {user_name(here.st_uid)} and not to {user_name(own_uid())}: set "
                 f"{DIRECTORY_VARIABLE} to a directory of your own, or {GROUP_VARIABLE} to the group that shares it"
             )
         if here.st_mode & _OPEN_TO_OTHERS:
@@ -97,75 +105,110 @@ class Directory:
                 "give it mode 0700, or 0750 for a group"
             )
         shared = above.st_mode & 0o022 and not above.st_mode & stat.S_ISVTX
-        if shared or above.st_uid not in (0, here.st_uid, os.geteuid()):
+        if shared or above.st_uid not in (0, here.st_uid, own_uid()):
             raise LinkError(
                 f"{self.path.parent}, the parent of {self.path.name}, can be changed by others: "
                 f"set {DIRECTORY_VARIABLE} to a directory in a place that only you can change"
             )
 
     def proxies(self) -> list[Proxy]:
-        """List the running proxies by name, and remove the sockets that killed proxies left behind."""
+        """List the running proxies by name, and remove what killed proxies left behind."""
         try:
             self.check()
         except FileNotFoundError:
             return []
         found = []
-        for path in sorted(self.path.glob("*" + self._suffix)):
-            name = path.name.removesuffix(self._suffix)
-            if not NAME.fullmatch(name):
-                continue
-            if is_live(path):
-                found.append(Proxy(name, owner_pid(path), path))
+        for name, path, system in self._files():
+            if system.is_live(path):
+                found.append(Proxy(name, system.owner_pid(path), path))
             else:
-                self._remove_stale(path)
+                self._remove_stale(path, system)
         return found
 
-    def _remove_stale(self, path: Path) -> None:
-        """Remove the socket of a killed proxy unless the lock is held, because a reader never waits."""
-        if self._lstat(self.path).st_uid != os.geteuid():
+    def running(self) -> dict[str, Path]:
+        """Return the running proxies' files by name, without any check or change; empty without the directory."""
+        return {name: path for name, path, system in self._files() if system.is_live(path)}
+
+    def _files(self) -> list[tuple[str, Path, System]]:
+        found = []
+        sides = {system.SUFFIXES[self._kind]: system for system in systems().values()}
+        with contextlib.suppress(FileNotFoundError), os.scandir(self.path) as entries:
+            for entry in entries:
+                name, dot, suffix = entry.name.rpartition(".")
+                system = sides.get(dot + suffix)
+                if system is not None and NAME.fullmatch(name):
+                    found.append((name, self.path / entry.name, system))
+        return sorted(found, key=lambda file: file[:2])
+
+    def _remove_stale(self, path: Path, system: System) -> None:
+        """Remove the file of a killed proxy unless the lock is held, because a reader never waits."""
+        if sys.platform != "win32" and self._lstat(self.path).st_uid != own_uid():
             return  # members of a group may read the directory, but can't remove anything
         with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
-            if not is_live(path):  # a new proxy may have taken the name since then
-                path.unlink()
+            if not system.is_live(path):  # a new proxy may have taken the name since then
+                system.remove(path)
 
-    def listen(self, name: str) -> tuple[Socket, int]:
+    def connect(self, name: str) -> PacketSocket:
+        """Connect to a proxy, on whichever side it is.
+
+        Raises ``OSError``: ``FileNotFoundError`` if there is none, ``ConnectionRefusedError`` if it was killed, and
+        ``BlockingIOError`` if it does not accept.
+        """
+        check_name(name)
+        self.check()
+        killed = False
+        for system in systems().values():
+            path = self.path / (name + system.SUFFIXES[self._kind])
+            if not path.exists():
+                continue
+            try:
+                return system.connect(path)
+            except ConnectionRefusedError:
+                killed = True
+            except FileNotFoundError:
+                continue
+        number = errno.ECONNREFUSED if killed else errno.ENOENT
+        raise OSError(number, os.strerror(number))  # Python makes it one of the errors above
+
+    def listen(self, name: str) -> tuple[Listener, int]:
         """Listen under a name, replacing a killed proxy. Return the socket, and its file's inode for :meth:`remove`."""
         path = self.socket_path(name)
         self.create()
         with self.lock():
-            if is_live(path):
-                pid = owner_pid(path)
-                raise NameTakenError(
-                    f"the name {name!r} is in use by a running {self._kind}"
-                    f"{f' (pid {pid})' if pid is not None else ''}: choose another name, or stop that process"
-                )
-            path.unlink(missing_ok=True)
-            listener = Socket()
-            listener.bind(os.fspath(path))
-            if self.gid is not None:
-                os.chown(path, -1, self.gid)
-            path.chmod(0o600 if self.gid is None else 0o660)
-            listener.listen(128)
-            return listener, path.lstat().st_ino
+            for system in systems().values():
+                other = self.path / (name + system.SUFFIXES[self._kind])
+                if other.exists() and system.is_live(other):
+                    pid = system.owner_pid(other)
+                    raise NameTakenError(
+                        f"the name {name!r} is in use by a running {self._kind}"
+                        f"{f' (pid {pid})' if pid is not None else ''}: choose another name, or stop that process"
+                    )
+                system.remove(other)
+            return self.serving.listen(path, self.gid), path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
         """Remove the socket with this name if its file still has this inode. Errors are ignored."""
-        path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
-            if path.lstat().st_ino == inode:
-                path.unlink()
+            for system in systems().values():
+                path = self.path / (name + system.SUFFIXES[self._kind])
+                if path.exists() and path.lstat().st_ino == inode:
+                    system.remove(path)
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
         """Lock the directory against changes by others; :class:`LinkError` if this takes longer than ``timeout_s``."""
         here, path = self._lstat(self.path), self.path
-        flags = os.O_RDONLY | os.O_DIRECTORY
-        if here.st_mode & stat.S_IRWXG:
-            path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
-        descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
+        flags = os.O_RDWR | os.O_CREAT
+        if sys.platform != "win32":
+            flags |= os.O_CLOEXEC | os.O_NOFOLLOW
+        if sys.platform == "win32" or here.st_mode & stat.S_IRWXG:
+            path = path / _LOCK
+        else:
+            flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+        descriptor = os.open(path, flags, 0o600)
         try:
-            if path is not self.path and os.geteuid() == 0:  # root may have created it in another user's directory
-                os.fchown(descriptor, here.st_uid, -1)
+            if sys.platform != "win32" and path is not self.path and own_uid() == 0:
+                os.fchown(descriptor, here.st_uid, -1)  # root may have created it in another user's directory
             _lock(descriptor, path, timeout_s)
             yield
         finally:
@@ -193,6 +236,10 @@ def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
 
 
 def _group_id(group: str) -> int:
+    if sys.platform == "win32":
+        raise UsageError(f"{GROUP_VARIABLE} is {group!r}, and on Windows no group can share proxies")
+    import grp
+
     try:
         return grp.getgrnam(group).gr_gid
     except KeyError:
@@ -208,13 +255,6 @@ def _default_path() -> Path:
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
 
 
-def is_live(path: Path) -> bool:
-    """Return whether a process still holds the socket at this path."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
-        code = probe.connect_ex(os.fspath(path))
-    return code not in (errno.ECONNREFUSED, errno.ENOENT)
-
-
 def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list[str]]:
     """Return the names of other users' proxies on this host, by user. This process can't open their sockets.
 
@@ -224,11 +264,11 @@ def of_others(table: str, owner: Callable[[Path], int | None]) -> dict[str, list
     found: dict[str, list[str]] = {}
     for line in table.splitlines():
         path = Path(line[line.find("/") :]) if "/" in line else Path()
-        name = path.name.removesuffix(_SUFFIXES[PROXY])
+        name = path.name.removesuffix(_SOCKET)
         if path.parent.name != "skyloop" or name == path.name or not NAME.fullmatch(name):
             continue  # a directory with another name may belong to any program
         user = owner(path.parent)
-        if user is not None and user != os.geteuid() and name not in found.setdefault(user_name(user), []):
+        if user is not None and user != own_uid() and name not in found.setdefault(user_name(user), []):
             found[user_name(user)].append(name)
     return found
 
@@ -241,34 +281,9 @@ def directory_owner(path: Path) -> int | None:
     return None
 
 
-def owner_pid(path: Path) -> int | None:
-    """Return the id of the process that listens at this path; None if it can't be determined immediately."""
-    probe = Socket()
-    probe.setblocking(False)
-    try:
-        probe.connect(os.fspath(path))
-        return credentials(probe).pid
-    except OSError:
-        return None
-
-
-def connect(path: Path) -> Socket:
-    """Connect to the socket at this path; ``OSError`` if no process accepts within :data:`CONNECT_TIMEOUT_S`."""
-    sock = Socket()
-    # Without a time-out, connecting to a stopped process with a full queue would block forever.
-    set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
-    sock.connect(os.fspath(path))
-    return sock
-
-
 def _lock(descriptor: int, path: Path, timeout_s: float) -> None:
     deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if time.monotonic() > deadline:
-                raise LinkError(f"{path} is locked by another process, which appears to be stopped") from None
-            time.sleep(0.005)
-        else:
-            return
+    while not try_lock(descriptor):
+        if time.monotonic() > deadline:
+            raise LinkError(f"{path} is locked by another process, which appears to be stopped")
+        time.sleep(0.005)

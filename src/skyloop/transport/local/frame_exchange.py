@@ -8,66 +8,46 @@ There is always a free slot, because each viewer can hold only a limited number 
 from __future__ import annotations
 
 import contextlib
-import errno
-import fcntl
 import itertools
-import mmap
-import os
 import threading
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
 
-from skyloop.errors import LinkError, UnsupportedError
 from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 
 MAX_LEASES: Final = 4  #: maximum number of a camera's frames that one client may hold, including frames in transit
-F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# Once the server has mapped the memory, it keeps that writeable view. No other writeable view can be created, and the
-# size can't be changed. If a slot could shrink while mapped by a reader, reading it would kill the reader (SIGBUS).
-_SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 
 
-class SlotMemory:
+class SlotMemory(ABC):
     """One slot at the server: memory for a frame, and the number of holders."""
 
-    __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
+    __slots__ = ("array", "capacity", "generation", "holders", "number")
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
         """Reserve the memory [bytes]. Raises ``OSError`` if memory or descriptors run out."""
-        self.fd = -1  # for __del__, if reserving the memory fails
         self.number = number
         self.generation = generation
         self.capacity = capacity
         self.holders = 0  #: number of clients that hold the slot, plus the server while it writes or keeps it
-        self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
-        os.posix_fallocate(self.fd, 0, capacity)  # if memory is short, fail here rather than during a copy
-        view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
-        self.array: Pixels = np.frombuffer(view, np.uint8)
-        fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, _SEALS)
+        self.array = self._reserve()
 
-    def __del__(self) -> None:
-        if self.fd >= 0:
-            os.close(self.fd)
+    @abstractmethod
+    def _reserve(self) -> Pixels:
+        """Return the memory, which the object owns from now on."""
 
-
-def check_support() -> None:
-    """Check that the kernel supports the transport."""
-    try:
-        SlotMemory(0, 0, mmap.PAGESIZE)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EPERM):
-            raise LinkError(f"cannot make shared memory for frames: {error.strerror}") from None
-        raise UnsupportedError(
-            f"this kernel has no sealed shared memory ({error.strerror}): the local transport needs Linux 5.1 or later"
-        ) from None
+    @abstractmethod
+    def announce(self, connection: Connection, camera: int) -> None:
+        """Send what a client needs to map the slot, like :meth:`Connection.transmit`."""
 
 
 _Newest = tuple[SlotMemory, bytes]
+_NewSlot = Callable[[int, int, int], SlotMemory]
 
 
 class Connection(Protocol):
@@ -100,7 +80,7 @@ class Viewer:
                 connection.transmit(packets.retire(camera, self.retire_before))
                 self.retire_before = 0
             if slot.number not in self.announced:
-                connection.transmit_descriptor(packets.slot(slot.number, camera, slot.capacity), slot.fd)
+                slot.announce(connection, camera)
                 self.announced.add(slot.number)
             connection.transmit(packet)
         except OSError:
@@ -114,8 +94,9 @@ class Viewer:
 class Camera:
     """The slots and viewers of one camera. Not thread-safe: :class:`FrameExchange` holds a lock."""
 
-    def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
+    def __init__(self, number: int, slot_numbers: Iterator[int], new_slot: _NewSlot) -> None:
         self.number = number
+        self._new_slot = new_slot
         self.viewers: dict[Connection, Viewer] = {}  # including inactive viewers, which only hold frames
         self.active: tuple[Viewer, ...] = ()  # viewers that get frames
         self._generation = 0
@@ -139,7 +120,7 @@ class Camera:
         if self._free:
             slot = self._free.pop()  # the slot freed last is probably still in the processor's cache
         else:
-            slot = SlotMemory(next(self._slot_numbers), self._generation, self._capacity)
+            slot = self._new_slot(next(self._slot_numbers), self._generation, self._capacity)
             self._next_number = slot.number + 1
             self._count += 1
         slot.holders = 1
@@ -226,7 +207,8 @@ class Camera:
 class FrameExchange:
     """Manages all cameras of a server. Thread-safe. Frames are copied without holding the lock."""
 
-    def __init__(self) -> None:
+    def __init__(self, new_slot: _NewSlot) -> None:
+        self._new_slot = new_slot
         self._lock = threading.Lock()
         self._cameras: dict[str, Camera] = {}
         self._slot_numbers = itertools.count(1)
@@ -253,7 +235,7 @@ class FrameExchange:
         with self._lock:
             camera = self._cameras.get(name)
             if camera is None:
-                camera = self._cameras[name] = Camera(next(self._camera_numbers), self._slot_numbers)
+                camera = self._cameras[name] = Camera(next(self._camera_numbers), self._slot_numbers, self._new_slot)
             camera.subscribe(connection)
 
     def unsubscribe(self, connection: Connection, name: str) -> None:

@@ -6,6 +6,7 @@ tables.
 
 from __future__ import annotations
 
+import re
 import struct
 from enum import IntEnum
 from typing import Final, NamedTuple
@@ -17,6 +18,7 @@ from skyloop.transport.base import MAX_TOPIC
 
 REVISION: Final = 1  #: revision of the packets that only the local transport uses
 MAX_REASON: Final = 400  #: bytes of UTF-8 in a reason
+MEMORY_NAME: Final = re.compile(r"[a-z0-9-]{1,30}")  #: a slot's shared memory; macOS allows 31 bytes with its slash
 
 
 class LocalKind(IntEnum):
@@ -30,6 +32,7 @@ class LocalKind(IntEnum):
     RETIRE = 0x45  #: server to client: the older slots of a camera will not be used again
     BYE = 0x46  #: either direction: the reason why the connection ends
     WAKE = 0x47  #: client to server: older applications send this before each command, and it is ignored
+    NAMED_SLOT = 0x48  #: server to client: a slot in named shared memory
 
 
 # A packet's sixth byte is its kind. The byte is compared with these kinds without conversion.
@@ -64,6 +67,15 @@ class Slot(NamedTuple):
     capacity: int
 
 
+class NamedSlot(NamedTuple):
+    """A :class:`Slot` in shared memory with this name."""
+
+    slot: int
+    camera: int
+    capacity: int
+    name: str
+
+
 class Frame(NamedTuple):
     """A frame in a slot."""
 
@@ -84,7 +96,7 @@ class Bye(NamedTuple):
     reason: str
 
 
-Message = Hello | Subscribe | Release | Slot | Frame | Retire | Bye
+Message = Hello | Subscribe | Release | Slot | NamedSlot | Frame | Retire | Bye
 
 _HELLO = struct.Struct("<H")
 _NUMBER = struct.Struct("<I")
@@ -113,6 +125,10 @@ def release(slot: int) -> bytes:
 
 def slot(number: int, camera: int, capacity: int) -> bytes:
     return _packet(LocalKind.SLOT, _SLOT.pack(number, camera, capacity))
+
+
+def named_slot(number: int, camera: int, capacity: int, name: str) -> bytes:
+    return _packet(LocalKind.NAMED_SLOT, _SLOT.pack(number, camera, capacity) + name.encode())
 
 
 def frame(number: int, header: bytes) -> bytes:
@@ -151,6 +167,12 @@ def parse(packet: bytes) -> Message:
             return Subscribe(topic, bool(on))
         if kind == LocalKind.BYE:
             return Bye(body[:MAX_REASON].decode(errors="replace"))
+        if kind == LocalKind.NAMED_SLOT:
+            name = body[_SLOT.size :].decode()
+            if not MEMORY_NAME.fullmatch(name):
+                raise DecodeError(f"{name[:64]!r} can't be the name of a slot's memory")
+            number, camera, capacity = _SLOT.unpack_from(body)
+            return NamedSlot(number, camera, capacity, name)
         layout, message = _FIXED[kind]
         return message(*layout.unpack(body))
     except (KeyError, IndexError, struct.error, UnicodeDecodeError) as error:

@@ -14,8 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import select
 import threading
 import time
 from collections import deque
@@ -24,8 +22,8 @@ from typing import Final
 
 from skyloop.transport.base import MAX_PACKET, ServerHandler
 from skyloop.transport.local import packets
-from skyloop.transport.local.server import HELLO_S, LocalServer
-from skyloop.transport.local.sockets import RECEIVE_FLAGS, ServerConnection, Socket
+from skyloop.transport.local.server import HELLO_S, LocalServer, ServerConnection
+from skyloop.transport.local.system import RECEIVE_FLAGS, Listener, StrangerError, serving_side, systems
 from skyloop.transport.priority import MOST_PACKETS, Lane, is_command
 
 CHECK_S: Final = 0.5  #: interval between checks of silent connections, and of listeners that could not accept
@@ -48,7 +46,7 @@ class Source:
     """A socket that a reactor waits for: a server's listener (``sock``) or one of its connections."""
 
     def __init__(
-        self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
+        self, server: SharedLocalServer, sock: Listener | None = None, connection: ServerConnection | None = None
     ) -> None:
         self.server = server
         self.sock = sock
@@ -72,9 +70,7 @@ class Reactor:
         self.entries = 0  #: number of times that :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
-        self._epoll = select.epoll()
-        self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
-        self._epoll.register(self._waker, select.EPOLLIN)
+        self._poller = systems()[serving_side()].new_poller()
         self._closing = False
         self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # sources that have packets to handle
         self._resumed: deque[Source] = deque()
@@ -86,7 +82,7 @@ class Reactor:
         """Start waiting for a socket. Thread-safe."""
         with self._lock:
             self._sources[source.fileno] = source
-            self._epoll.register(source.fileno, select.EPOLLIN)
+            self._poller.register(source.fileno)
 
     def remove(self, source: Source) -> bool:
         """Stop waiting for a socket; return whether this reactor was waiting for it. Thread-safe."""
@@ -94,8 +90,7 @@ class Reactor:
             if self._sources.get(source.fileno) is not source:
                 return False
             del self._sources[source.fileno]
-            if not self._epoll.closed:
-                self._epoll.unregister(source.fileno)
+            self._poller.unregister(source.fileno)
             return True
 
     @property
@@ -136,37 +131,33 @@ class Reactor:
     def resume(self, sources: Iterable[Source]) -> None:
         """Handle packets that another reactor has received. Thread-safe."""
         self._resumed.extend(sources)
-        self._wake()
+        self._poller.wake()
 
     def close(self) -> None:
         """End the thread after its current task. Stop its servers first. Idempotent."""
         if not self._closing:
             self._closing = True
-            self._wake()
+            self._poller.wake()
         if threading.current_thread() is not self._thread and self.inside is None:
             self._thread.join()
-
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):
-            os.eventfd_write(self._waker, 1)
 
     # --- on its thread ---
 
     def _run(self) -> None:
-        checked_s = time.monotonic()
+        checked_s, poll = time.monotonic(), self._poller.poll
         while not self._closing:
             busy = any(self._lanes)
             if not busy:
                 self.inside = None
             begun_s = time.monotonic()
-            ready = self._epoll.poll(0 if busy else CHECK_S)
+            ready = poll(0 if busy else CHECK_S)
             # After a pause, a packet is most likely the only one. If there are many, checking each socket for another
             # one would cost a system call each; instead, all sockets are polled together until nothing new arrives.
             waited = time.monotonic() - begun_s > _PAUSE_S
             try:
                 if self._receive(ready, at_once=waited and len(ready) == 1):
                     for _ in range(MOST_PACKETS):
-                        if not self._receive(self._epoll.poll(0), at_once=False):
+                        if not self._receive(poll(0), at_once=False):
                             break
                 for _ in range(_PACKETS_PER_POLL):
                     if not any(self._lanes):
@@ -179,8 +170,7 @@ class Reactor:
                 _log.exception("a turn of the receiving thread failed; it continues")
                 time.sleep(_AFTER_FAILURE_S)  # the cause may persist, and must not use up all processor time
         self.inside = None
-        os.close(self._waker)
-        self._epoll.close()
+        self._poller.close()
 
     def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
         """Read a packet from each socket to see which are urgent or superseded; return whether more may wait."""
@@ -190,8 +180,8 @@ class Reactor:
             if source is not None:
                 self._enter(source.server)
                 more = source.server.receive(self, source, at_once) or more
-            elif fileno == self._waker:
-                os.eventfd_read(self._waker)
+            elif fileno == self._poller.waker:
+                self._poller.drain()
                 while self._resumed:
                     source = self._resumed.popleft()
                     self.line_up(source, source.lane)
@@ -221,7 +211,7 @@ class Reactor:
         """Ignore a listener until the next check, because it can't accept connections but would always be ready."""
         source.muted = True
         with self._lock, contextlib.suppress(OSError):
-            self._epoll.modify(source.fileno, 0)
+            self._poller.mute(source.fileno, True)
 
     def _check(self) -> None:
         """End connections that have sent nothing, and retry listeners that failed."""
@@ -232,7 +222,7 @@ class Reactor:
             if source.muted:
                 source.muted = False
                 with self._lock, contextlib.suppress(OSError):
-                    self._epoll.modify(source.fileno, select.EPOLLIN)
+                    self._poller.mute(source.fileno, False)
             elif source.connection is not None and not source.connection.joined:
                 self._enter(source.server)
                 source.server.end_silent(self, source, now_s)
@@ -253,14 +243,14 @@ class SharedLocalServer(LocalServer):
         self._served: set[ServerConnection] = set()
         self._left = threading.Condition()  # guards the set; notified when a connection has ended
 
-    def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+    def _begin(self, handler: ServerHandler, listener: Listener, inode: int) -> None:
         listener.setblocking(False)
         self._handler = handler
         self._inode = inode
         self._listening = Source(self, sock=listener)
         self.reactor.add(self._listening)
 
-    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the source owns it)
+    def _finish(self, listener: Listener) -> None:  # noqa: ARG002  (the source owns it)
         source, self._listening = self._listening, None
         if source is not None:
             self._drop(source)
@@ -363,12 +353,16 @@ class SharedLocalServer(LocalServer):
             accepted, _ = source.sock.accept()
         except BlockingIOError:
             return
+        except StrangerError as error:
+            assert self._handler is not None
+            self._refuse(self._handler, error)
+            return
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
                 _log.warning("%s cannot accept: %s", self.address, error)  # out of descriptors or memory
                 reactor.mute(source)
             return
-        connection = self._let_in(Socket(accepted.detach()))
+        connection = self._let_in(accepted)
         if connection is not None:
             with self._left:
                 self._served.add(connection)

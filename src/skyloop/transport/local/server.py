@@ -9,7 +9,6 @@ arrival. A thread whose turn comes late reads all its waiting packets, and passe
 from __future__ import annotations
 
 import logging
-import os
 import threading
 from typing import Final
 
@@ -18,6 +17,7 @@ from skyloop.messages import FrameHeader
 from skyloop.transport.base import (
     MAX_PACKET,
     MAX_SUBSCRIPTIONS,
+    NOBODY,
     Peer,
     Pixels,
     ServerHandler,
@@ -30,10 +30,19 @@ from skyloop.transport.base import (
 )
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.frame_exchange import FrameExchange, check_support
+from skyloop.transport.local.frame_exchange import FrameExchange
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.sockets import Credentials, ServerConnection, Socket, credentials, may_connect, user_name
-from skyloop.transport.priority import SUPERSEDED, Lane, PriorityLock, is_command
+from skyloop.transport.local.system import (
+    RECEIVE_FLAGS,
+    SEND_FLAGS,
+    Credentials,
+    Listener,
+    PacketSocket,
+    StrangerError,
+    own_uid,
+    user_name,
+)
+from skyloop.transport.priority import MOST_PACKETS, SUPERSEDED, Lane, PacketBacklog, PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128  #: maximum number of connections
 #: Connections allowed per process, so that no program takes them all. A cockpit page that flies has its own process.
@@ -46,12 +55,76 @@ _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
+class ServerConnection:
+    """An application's connection. Any thread may send without waiting; everything else is for its receiving thread."""
+
+    def __init__(self, sock: PacketSocket, peer: Peer, who: Credentials) -> None:
+        sock.limit_backlog()
+        self.who = who  #: as the kernel reports it
+        self._socket = sock
+        self._send = sock.send
+        self.receive = sock.recv
+        self.poll = sock.poller()  #: returns whether a packet or the end is waiting; for the receiving thread
+        self.backlog = PacketBacklog()  #: packets that were taken from the socket but have not been handled yet
+        self.peer = peer
+        self.joined = False  #: whether the application has sent Hello, so that the handler knows about it
+        self.admitted = False  #: whether the application has identified itself, so that the handler has admitted it
+        self.pilot = False  #: whether the application connected as a pilot
+        self.ending = False  #: whether the server is ending the connection, so that earlier packets no longer count
+        self.reason = ""  #: the reason why the connection ends, once either end has given one
+        self.topics: set[str] = set()
+
+    def fileno(self) -> int:
+        """Return the socket's descriptor, so that several sockets can be polled together."""
+        return self._socket.fileno()
+
+    def more(self) -> bool:
+        """Return whether the socket contains a pilot's packet or the end. Other clients can't command anyway."""
+        return self.pilot and bool(self.poll(0))
+
+    def take_in(self) -> int:
+        """Move waiting packets from the socket to the backlog; return how many commands were superseded."""
+        superseded = 0
+        backlog = self.backlog
+        for _ in range(MOST_PACKETS):
+            if backlog.full or not self.more():
+                break
+            try:
+                packet = self.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
+            except OSError:
+                break  # the next read returns the same packet again
+            if packet == packets.WAKE:
+                continue
+            superseded += backlog.put(packet)
+            if not packet:
+                break  # the end
+        return superseded
+
+    def limit_silence(self, seconds: float) -> None:
+        """Set how long :attr:`receive` waits [s] before it raises ``BlockingIOError``. With 0, it waits forever."""
+        self._socket.limit_wait(seconds)
+
+    def transmit(self, packet: bytes) -> None:
+        """Send a packet without waiting. Any thread. ``OSError``: the application has ended, or its buffer is full."""
+        self._send(packet, SEND_FLAGS)
+
+    def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
+        """Send a packet with a file descriptor, like :meth:`transmit`."""
+        self._socket.send_descriptor(packet, descriptor)
+
+    def hang_up(self, reason: str) -> None:
+        """End the connection with a reason. Any thread. The receiving thread treats it like any other end."""
+        if not self.ending:
+            self.reason = self.reason or reason
+            self.ending = True
+            self._socket.hang_up(packets.bye(self.reason))
+
+
 class LocalServer(TransportServer):
     """A proxy's end of the local transport. Clients on this host find it by its name. It can be started only once.
 
-    :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, :class:`LinkError` if the directory
-    of sockets is not safe, and :class:`UnsupportedError` if the kernel lacks a required feature. ``group``: users who
-    may also connect (``SKYLOOP_GROUP``).
+    :meth:`start` raises :class:`NameTakenError` if a running proxy uses the name, and :class:`LinkError` if the
+    directory of sockets is not safe. ``group``: users who may also connect (``SKYLOOP_GROUP``).
     """
 
     def __init__(self, name: str, *, group: str | None = None) -> None:
@@ -59,7 +132,8 @@ class LocalServer(TransportServer):
         self._name = name
         self._directory = find_directory(group)
         self._directory.socket_path(name)  # if the path is too long, raise here rather than in ``start``
-        self._exchange = FrameExchange()
+        self._system = self._directory.serving
+        self._exchange = FrameExchange(self._system.new_slot)
         # These are replaced under the lock and never changed in place, so that any thread may read them.
         self._connections: set[ServerConnection] = set()
         self._peers: dict[int, ServerConnection] = {}  # by the peer's number
@@ -71,20 +145,19 @@ class LocalServer(TransportServer):
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
         self._stopping = threading.Event()
-        self._listener: Socket | None = None
+        self._listener: Listener | None = None
         self._thread: threading.Thread | None = None
 
     def start(self, handler: ServerHandler) -> None:
         with self._state_lock:
             if self._started:
                 raise UsageError(f"{self.address} was started before: create a new {type(self).__name__}")
-            check_support()
             listener, inode = self._directory.listen(self._name)
             self._started = True
             self._listener = listener
             self._begin(handler, listener, inode)
 
-    def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+    def _begin(self, handler: ServerHandler, listener: Listener, inode: int) -> None:
         """Start accepting and receiving."""
         self._thread = threading.Thread(
             target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
@@ -100,7 +173,7 @@ class LocalServer(TransportServer):
             listener.hang_up()  # wakes the accepting thread
         self._finish(listener)
 
-    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (the accepting thread owns it)
+    def _finish(self, listener: Listener) -> None:  # noqa: ARG002  (the accepting thread owns it)
         """Wait until the accepting thread and all receiving threads have ended."""
         thread = self._thread
         if thread is not None and threading.get_ident() not in self._receivers:
@@ -161,7 +234,7 @@ class LocalServer(TransportServer):
 
     # --- on the accepting thread ---
 
-    def _run(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+    def _run(self, handler: ServerHandler, listener: Listener, inode: int) -> None:
         threads: list[threading.Thread] = []
         try:
             while not self._stopping.is_set():
@@ -175,17 +248,20 @@ class LocalServer(TransportServer):
             for thread in threads:
                 thread.join()
 
-    def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
+    def _accept(self, handler: ServerHandler, listener: Listener) -> threading.Thread | None:
         """Accept one connection and start receiving from it. Return its receiving thread, or None."""
         try:
             accepted, _ = listener.accept()
+        except StrangerError as error:
+            self._refuse(handler, error)
+            return None
         except OSError as error:
             if not self._stopping.is_set() and not isinstance(error, ConnectionError):
                 # Out of descriptors or memory: without a pause, this thread would spin.
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
-        connection = self._let_in(Socket(accepted.detach()))
+        connection = self._let_in(accepted)
         if connection is None:
             return None
         connection.limit_silence(HELLO_S)
@@ -201,10 +277,18 @@ class LocalServer(TransportServer):
             return None
         return thread
 
-    def _let_in(self, sock: Socket) -> ServerConnection | None:
+    def _refuse(self, handler: ServerHandler, error: StrangerError) -> None:
+        """Report a process that was not let in."""
+        with self._lock:
+            try:
+                handler.refused(NOBODY, str(error))
+            except Exception:  # noqa: BLE001  (a handler may raise anything)
+                _log.exception("the handler of %s failed in refused()", self.address)
+
+    def _let_in(self, sock: PacketSocket) -> ServerConnection | None:
         """Return the caller's connection; None if the caller may not connect or there is no room."""
-        who = credentials(sock)
-        if not may_connect(sock, self._directory.gid):
+        who = sock.who
+        if not self._system.may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
             return None
         if problem := self._make_room(who):
@@ -227,7 +311,7 @@ class LocalServer(TransportServer):
             # A process outside our process namespace has the number 0.
             if who.pid and sum(other.who.pid == who.pid for other in present) >= MAX_PER_PROCESS:
                 return f"pid {who.pid} has {MAX_PER_PROCESS} connections to {self.address}: end some of them"
-            if who.uid not in (0, os.geteuid()) and sum(other.who.uid == who.uid for other in present) >= MAX_PER_USER:
+            if who.uid not in (0, own_uid()) and sum(other.who.uid == who.uid for other in present) >= MAX_PER_USER:
                 return f"{user_name(who.uid)} has {MAX_PER_USER} connections to {self.address}: end some of them"
             if len(present) < MAX_CLIENTS:
                 return ""

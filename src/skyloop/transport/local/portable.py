@@ -1,0 +1,572 @@
+"""The portable side of the local transport: loopback TCP between processes that share a secret, and selectors.
+
+A server listens on a port of 127.0.0.1. Its *registration*, a file that only its user can read, holds the port and a
+random secret. Both ends prove that they know the secret before the first packet (``docs/wire-format.md``), so other
+users of the host, and programs that took over the port of an ended server, learn nothing. The server holds a lock on
+its registration. The lock ends with the process and shows whether it still runs.
+
+Each packet follows its length in four bytes. If the kernel takes only a part of a packet, a thread sends the rest when
+there is room, and further packets are refused until then.
+"""
+
+from __future__ import annotations
+
+import _thread
+import errno
+import hashlib
+import hmac
+import logging
+import math
+import os
+import secrets
+import select
+import selectors
+import socket
+import struct
+import sys
+import tempfile
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from skyloop.child_process import leave_to_parent
+from skyloop.errors import LinkError, UsageError
+from skyloop.transport.base import Pixels
+from skyloop.transport.local.named_memory import NamedSlot, prefix, remove_names
+from skyloop.transport.local.system import (
+    CONNECT_TIMEOUT_S,
+    HOST,
+    PROXY,
+    Credentials,
+    PacketSocket,
+    StrangerError,
+    own_uid,
+    try_lock,
+)
+
+SUFFIXES: Final = {PROXY: ".port", HOST: ".hostport"}
+VERSION: Final = 1  #: of the registration and the handshake
+HANDSHAKE_S: Final = 2.0  #: time for both ends to prove that they know the secret
+MAX_STRANGERS: Final = 32  #: connections that have not done that yet; of more, the oldest is closed
+_HOST: Final = "127.0.0.1"
+#: Size of each end's buffer. On Linux, 290 packets of 66 bytes or 66 of 300 wait for a stalled reader, about as many as
+#: on the fast side. Larger packets are sent in part, and completed while the other end reads.
+_BUFFER: Final = 16_384
+_LENGTH: Final = 4  # bytes before each packet
+_LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
+_SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
+_LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
+_MOST_WAITING: Final = 128
+_FAILED_S: Final = 0.2  # pause after a failure to accept, when descriptors or memory have run out
+_REGISTRATION: Final = struct.Struct("<8sHHI32s32s")  # magic, version, port, process, secret, names of its memory
+_MAGIC: Final = b"SkyPort\n"
+_NONCE: Final = 32
+_PROOF: Final = struct.Struct("<4sHI32s32s")  # magic, version, process, the client's nonce, its MAC
+_PROOF_MAGIC: Final = b"SKYL"
+_MAC: Final = 32
+_log = logging.getLogger(__name__)
+
+
+class Registration(NamedTuple):
+    """The content of a server's file."""
+
+    port: int
+    pid: int
+    secret: bytes
+    memory: str  #: what the names of its shared memory begin with
+
+    def mac(self, who: bytes, server_nonce: bytes, client_nonce: bytes, pid: int) -> bytes:
+        """Return the proof of one end."""
+        said = who + struct.pack("<HI", VERSION, pid) + server_nonce + client_nonce
+        return hmac.digest(self.secret, said, hashlib.sha256)
+
+
+_TURNED_AWAY: Final = "a process that wanted to connect was turned away"
+_CLIENT: Final = b"skyloop client"
+_SERVER: Final = b"skyloop server"
+
+
+def check_support() -> None:
+    """Do nothing: this side works everywhere."""
+
+
+class _TcpSocket(socket.socket):
+    """A socket that closes itself when nothing refers to it any more."""
+
+    def __del__(self) -> None:
+        self.close()
+
+
+class StreamSocket:
+    """A TCP connection that carries packets; see :class:`skyloop.transport.local.system.PacketSocket`."""
+
+    def __init__(self, sock: socket.socket, who: Credentials) -> None:
+        self.who = who
+        self._socket = _TcpSocket(fileno=sock.detach())
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._poll = _waiter(self._socket)
+        self._wait_s = 0.0
+        # Re-entrant, because the garbage collector or a signal's handler may send in the middle of another call.
+        self._sending = threading.RLock()
+        self._inside = False  # whether a call that sends is under way
+        self._rest = b""  # the unsent end of a packet that was sent in part
+        self._partial = bytearray()  # the beginning of an incomplete packet, with its length
+        self._ended = False
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def send(self, packet: bytes, flags: int = 0) -> int:  # noqa: ARG002  (never waits)
+        with self._sending:
+            self._send(packet)
+        return len(packet)
+
+    def post(self, packet: bytes) -> None:
+        if not self._sending.acquire(blocking=False):
+            raise BlockingIOError(errno.EAGAIN, "another thread is sending")
+        try:
+            self._send(packet)
+        finally:
+            self._sending.release()
+
+    def _send(self, packet: bytes) -> None:
+        if self._inside or self._rest:
+            raise BlockingIOError(errno.EAGAIN, "an earlier packet is not complete yet")
+        self._inside = True
+        try:
+            content = len(packet).to_bytes(_LENGTH, "little") + packet
+            sent = self._socket.send(content)
+            if sent < len(content):
+                self._rest = content[sent:]
+                _thread.start_new_thread(self._complete, ())
+        except RuntimeError as error:  # no more threads
+            self.hang_up()
+            raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
+        finally:
+            self._inside = False
+
+    def _complete(self) -> None:
+        """Send the rest of a packet as soon as there is room."""
+        with suppress(OSError, ValueError):  # the connection has ended, or was closed
+            wait = _waiter(self._socket, to_send=True)
+            while self._rest and not self._ended:
+                wait(_SLICE_MS)
+                with self._sending, suppress(BlockingIOError):
+                    self._rest = self._rest[self._socket.send(self._rest) :]
+
+    def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
+        raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
+
+    def send_within(self, packet: bytes, seconds: float) -> None:
+        deadline_s = time.monotonic() + seconds
+        while True:
+            try:
+                self.send(packet)
+            except BlockingIOError:
+                if time.monotonic() > deadline_s:
+                    raise
+                time.sleep(0.001)
+            else:
+                return
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        if not flags:
+            self._wait()
+        while not self._ended:
+            try:
+                packet = self._next(size)
+            except ConnectionError:
+                break
+            except BlockingIOError:  # only a part of a packet has arrived
+                if flags:
+                    raise
+                self._wait()
+                continue
+            self._ended = not packet
+            return packet
+        self._ended = True
+        return b""
+
+    def receiver(self, size: int) -> Callable[[], tuple[bytes, Sequence[Any], int, Any]]:
+        return lambda: (self.recv(size), (), 0, None)
+
+    def _wait(self) -> None:
+        """Wait for something to arrive; ``BlockingIOError`` if nothing does for too long."""
+        deadline_s = time.monotonic() + self._wait_s if self._wait_s else math.inf
+        while not self._ended:
+            left_s = deadline_s - time.monotonic()
+            if self._poll(_SLICE_MS if left_s == math.inf else max(0, math.ceil(left_s * 1e3))):
+                return
+            if left_s <= 0.0:
+                raise BlockingIOError(errno.EAGAIN, "nothing has arrived")
+
+    def _next(self, size: int) -> bytes:
+        """Return the next packet; empty at the end. ``BlockingIOError``: it has not arrived completely."""
+        receive, partial = self._socket.recv, self._partial
+        # In the usual case, one call takes a whole packet. If a signal's handler raises an exception behind that call,
+        # a packet is lost, as with any socket, but not the boundary between packets.
+        if not partial:
+            head = receive(_LENGTH, socket.MSG_PEEK)
+            if not head:
+                return b""
+            content = receive(self._length(head)) if len(head) == _LENGTH else receive(len(head))
+            if len(head) == _LENGTH and len(content) == self._length(head):
+                return content[_LENGTH : _LENGTH + size]
+            partial += content
+        while (missing := (self._length(partial) if len(partial) >= _LENGTH else _LENGTH) - len(partial)) > 0:
+            content = receive(missing)
+            if not content:
+                return b""
+            partial += content
+        packet = bytes(partial[_LENGTH : _LENGTH + size])
+        partial.clear()
+        return packet
+
+    def _length(self, head: bytes | bytearray) -> int:
+        """Return how long a packet and its length are together."""
+        length = int.from_bytes(head[:_LENGTH], "little")
+        if length > _LONGEST:
+            raise ConnectionAbortedError(errno.ECONNABORTED, f"a packet of {length} bytes")
+        return _LENGTH + length
+
+    def descriptors(self, ancillary: Sequence[Any]) -> list[int]:  # noqa: ARG002
+        return []
+
+    def map_sealed(self, descriptor: int, capacity: int) -> Pixels:  # noqa: ARG002
+        raise LinkError("the proxy sent a descriptor over TCP")
+
+    def poller(self) -> Callable[[int], object]:
+        return self._poll
+
+    def limit_wait(self, seconds: float) -> None:
+        self._wait_s = seconds
+
+    def limit_backlog(self) -> None:
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+
+    def hang_up(self, last_packet: bytes = b"") -> None:
+        if last_packet:
+            with suppress(OSError):
+                self.send(last_packet)
+        self._ended = True
+        with suppress(OSError):  # the connection had already ended
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def _waiter(sock: socket.socket, *, to_send: bool = False) -> Callable[[int], object]:
+    """Return a function that waits for up to some time [ms], and returns whether the socket is ready."""
+    if sys.platform != "win32":
+        poll = select.poll()
+        poll.register(sock, select.POLLOUT if to_send else select.POLLIN)
+        return poll.poll
+    readers, writers = ([], [sock]) if to_send else ([sock], [])
+    return lambda wait_ms: any(select.select(readers, writers, [], None if wait_ms < 0 else wait_ms / 1e3))
+
+
+class SelectorPoller:
+    """Waits with the best means of this system, which on Windows are limited to 512 sockets."""
+
+    def __init__(self) -> None:
+        self._selector = selectors.DefaultSelector()
+        self._woken, self._bell = socket.socketpair()
+        for end in (self._woken, self._bell):
+            end.setblocking(False)
+        self.waker = self._woken.fileno()
+        self._selector.register(self.waker, selectors.EVENT_READ)
+
+    def poll(self, timeout_s: float) -> list[tuple[int, int]]:
+        try:
+            return [(key.fd, events) for key, events in self._selector.select(timeout_s)]
+        except OSError:  # on Windows: a socket was closed while this waited for it
+            return []
+
+    def register(self, fileno: int) -> None:
+        with suppress(KeyError):
+            self._selector.register(fileno, selectors.EVENT_READ)
+        self.wake()  # not every selector notices it otherwise
+
+    def unregister(self, fileno: int) -> None:
+        with suppress(KeyError, RuntimeError):  # already done, or closed
+            self._selector.unregister(fileno)
+
+    def mute(self, fileno: int, muted: bool) -> None:
+        (self.unregister if muted else self.register)(fileno)
+
+    def wake(self) -> None:
+        with suppress(OSError):  # it is awake, or closed
+            self._bell.send(b"\0")
+
+    def drain(self) -> None:
+        with suppress(BlockingIOError):
+            self._woken.recv(4096)
+
+    def close(self) -> None:
+        self._selector.close()
+        self._woken.close()
+        self._bell.close()
+
+
+new_slot = NamedSlot
+new_poller = SelectorPoller
+
+
+def check_path(path: Path) -> None:
+    """Do nothing: a file may have any path."""
+
+
+def listen(path: Path, gid: int | None) -> Gate:
+    if gid is not None:
+        raise UsageError(
+            "a group can't share proxies over the portable transport, where frames are only for their own user: "
+            "serve without a group"
+        )
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        if exclusive := getattr(socket, "SO_EXCLUSIVEADDRUSE", 0):  # Windows would let others listen on the same port
+            listener.setsockopt(socket.SOL_SOCKET, exclusive, 1)
+        _limit_received(listener)
+        listener.bind((_HOST, 0))
+        listener.listen(128)
+        registration = Registration(listener.getsockname()[1], os.getpid(), secrets.token_bytes(32), prefix())
+        return Gate(listener, registration, path, _register(path, registration))
+    except BaseException:
+        listener.close()
+        raise
+
+
+def _limit_received(sock: socket.socket) -> None:
+    """Limit what waits in the kernel to be read. Must be called before the connection is made."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+
+
+def _register(path: Path, registration: Registration) -> int:
+    """Write a registration in one step, and return a descriptor whose lock shows that it is alive."""
+    port, pid, secret, memory = registration
+    descriptor, part = tempfile.mkstemp(prefix=".", suffix=path.suffix, dir=path.parent)  # only for this user
+    try:
+        try:
+            os.write(descriptor, _REGISTRATION.pack(_MAGIC, VERSION, port, pid, secret, memory.encode()))
+        finally:
+            os.close(descriptor)
+        Path(part).replace(path)
+    except BaseException:
+        Path(part).unlink(missing_ok=True)
+        raise
+    descriptor = os.open(path, os.O_RDWR)
+    deadline_s = time.monotonic() + _LOCKED_WITHIN_S
+    while not try_lock(descriptor):  # others hold it for a moment when they look
+        if time.monotonic() > deadline_s:
+            os.close(descriptor)
+            path.unlink(missing_ok=True)
+            raise LinkError(f"{path} is locked by another process, which appears to be stopped")
+        time.sleep(0.005)
+    return descriptor
+
+
+def _read(path: Path) -> Registration:
+    """Read a registration. Raises ``OSError``, also for one of another version."""
+    content = path.read_bytes()
+    if len(content) != _REGISTRATION.size:
+        raise OSError(errno.EPROTO, "its registration is not complete")
+    magic, version, port, pid, secret, memory = _REGISTRATION.unpack(content)
+    if magic != _MAGIC or version != VERSION:
+        raise OSError(errno.EPROTO, f"its registration is not of version {VERSION} of the portable transport")
+    return Registration(port, pid, secret, memory.rstrip(b"\0").decode("ascii", "replace"))
+
+
+def is_live(path: Path) -> bool:
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    try:
+        return not try_lock(descriptor, shared=True)
+    finally:
+        os.close(descriptor)
+
+
+def owner_pid(path: Path) -> int | None:
+    try:
+        return _read(path).pid
+    except OSError:
+        return None
+
+
+def remove(path: Path) -> None:
+    with suppress(OSError):
+        registration = _read(path)
+        if registration.memory != prefix():  # otherwise, other servers of this process have the same memory
+            remove_names(registration.memory)
+    path.unlink(missing_ok=True)
+
+
+def may_connect(sock: PacketSocket, gid: int | None) -> bool:  # noqa: ARG001
+    """Return True: the other end has proved that it knows the secret."""
+    return True
+
+
+def connect(path: Path) -> StreamSocket:
+    registration = _read(path)
+    if not is_live(path):
+        raise ConnectionRefusedError(errno.ECONNREFUSED, "its process has ended")
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        _limit_received(sock)
+        sock.settimeout(CONNECT_TIMEOUT_S)
+        sock.connect((_HOST, registration.port))
+        _introduce(sock, registration, time.monotonic() + HANDSHAKE_S)
+    except TimeoutError:
+        sock.close()
+        raise BlockingIOError(errno.EAGAIN, "it does not answer") from None
+    except BaseException:
+        sock.close()
+        raise
+    return StreamSocket(sock, Credentials(registration.pid, own_uid(), 0))
+
+
+def _introduce(sock: socket.socket, registration: Registration, deadline_s: float) -> None:
+    """Prove to the server that this end knows the secret, and let the server prove the same."""
+    pid, ours = os.getpid(), secrets.token_bytes(_NONCE)
+    theirs = _receive(sock, _NONCE, deadline_s)
+    mac = registration.mac(_CLIENT, theirs, ours, pid)
+    sock.sendall(_PROOF.pack(_PROOF_MAGIC, VERSION, pid, ours, mac))
+    proof = _receive(sock, _MAC, deadline_s)
+    if not hmac.compare_digest(proof, registration.mac(_SERVER, theirs, ours, pid)):
+        raise ConnectionAbortedError(errno.ECONNABORTED, "the process at its port is not this proxy")
+
+
+def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
+    content = b""
+    while len(content) < size:
+        sock.settimeout(max(1e-3, deadline_s - time.monotonic()))
+        if not (more := sock.recv(size - len(content))):
+            raise ConnectionAbortedError(errno.ECONNABORTED, "it ended the connection: the secret is not its own")
+        content += more
+    return content
+
+
+def _challenge(sock: socket.socket, registration: Registration, deadline_s: float) -> int:
+    """Return the process at the other end if it knows the secret. Raises :class:`StrangerError` if it does not."""
+    pid: int
+    ours = secrets.token_bytes(_NONCE)
+    sock.sendall(ours)
+    magic, version, pid, theirs, mac = _PROOF.unpack(_receive(sock, _PROOF.size, deadline_s))
+    if magic != _PROOF_MAGIC or version != VERSION:
+        raise StrangerError(f"it does not speak version {VERSION} of the local transport's handshake")
+    if not hmac.compare_digest(mac, registration.mac(_CLIENT, ours, theirs, pid)):
+        raise StrangerError("it does not know the proxy's secret")
+    sock.sendall(registration.mac(_SERVER, ours, theirs, pid))
+    return pid
+
+
+class Gate:
+    """A server's socket. It lets only those in that know the secret, each of which has a thread until then."""
+
+    def __init__(self, listener: socket.socket, registration: Registration, path: Path, lock: int) -> None:
+        listener.settimeout(HANDSHAKE_S)
+        self._listener = listener
+        self._registration = registration
+        self._path = path
+        self._lock = lock
+        self._strangers: dict[socket.socket, None] = {}  # oldest first
+        self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
+        self._woken, self._bell = socket.socketpair()  # a byte for each of those
+        self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
+        self._bell.setblocking(False)
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="skyloop-gate", daemon=True)
+        self._thread.start()
+        leave_to_parent(self)
+
+    def __del__(self) -> None:
+        self._woken.close()
+
+    def forked(self) -> None:
+        """Close a forked child's copies. Otherwise, the registration would stay locked after the parent's end."""
+        self._listener.close()
+        if self._lock >= 0:
+            os.close(self._lock)
+
+    def fileno(self) -> int:
+        return self._woken.fileno()
+
+    def setblocking(self, flag: bool, /) -> None:
+        self._woken.setblocking(flag)
+
+    def accept(self) -> tuple[StreamSocket, object]:
+        if not self._woken.recv(1):
+            raise ConnectionAbortedError(errno.ECONNABORTED, "it no longer listens")
+        found = self._waiting.popleft()
+        if isinstance(found, str):
+            raise StrangerError(found)
+        return found, None
+
+    def hang_up(self) -> None:
+        self._closing = True
+        with suppress(OSError):  # wakes the thread, which otherwise looks every two seconds
+            socket.create_connection((_HOST, self._registration.port), CONNECT_TIMEOUT_S).close()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closing:
+            try:
+                sock, _ = self._listener.accept()
+            except (TimeoutError, ConnectionError):
+                continue
+            except OSError as error:  # descriptors or memory have run out
+                _log.warning("%s cannot accept: %s", self._path.name, error)
+                time.sleep(_FAILED_S)
+                continue
+            if len(self._strangers) >= MAX_STRANGERS and (oldest := next(iter(self._strangers), None)):
+                self._strangers.pop(oldest, None)
+                with suppress(OSError):  # its thread ends it
+                    oldest.shutdown(socket.SHUT_RDWR)
+                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
+            self._strangers[sock] = None
+            try:
+                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
+            except RuntimeError as error:  # no more threads
+                _log.warning("%s cannot accept: %s", self._path.name, error)
+                self._strangers.pop(sock)
+                sock.close()
+        self._listener.close()
+        if sys.platform != "win32":  # a locked file can be removed, so that no one takes it for that of a killed proxy
+            with suppress(OSError):
+                if self._path.lstat().st_ino == os.fstat(self._lock).st_ino:
+                    self._path.unlink()
+        lock, self._lock = self._lock, -1
+        os.close(lock)
+        self._bell.close()
+
+    def _greet(self, sock: socket.socket) -> None:
+        found: StreamSocket | str = ""
+        try:
+            pid = _challenge(sock, self._registration, time.monotonic() + HANDSHAKE_S)
+            found = StreamSocket(sock, Credentials(pid, own_uid(), 0))
+        except StrangerError as error:
+            found = f"{_TURNED_AWAY}: {error}"
+        except TimeoutError:
+            found = f"{_TURNED_AWAY}: it did not prove within {HANDSHAKE_S:g} s that it knows the secret"
+        except OSError:
+            pass  # it only looked who is there, or gave up
+        self._strangers.pop(sock, None)
+        if isinstance(found, str):
+            sock.close()
+        if found:
+            self._pass_on(found)
+
+    def _pass_on(self, found: StreamSocket | str) -> None:
+        if len(self._waiting) < _MOST_WAITING:  # otherwise, the server is too busy to accept anybody
+            self._waiting.append(found)
+            with suppress(OSError):  # it no longer listens
+                self._bell.send(b"\0")

@@ -1,0 +1,575 @@
+"""The portable side: who is let in, packets in pieces, and memory that killed processes leave behind."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+import selectors
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import LinkError, UsageError
+from skyloop.transport.base import MAX_PACKET, NOBODY, video
+from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
+from skyloop.transport.local.portable import Registration, StreamSocket
+from skyloop.transport.local.system import PORTABLE, Credentials, System
+from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
+
+pytestmark = [pytest.mark.side(PORTABLE), pytest.mark.usefixtures("side")]
+SYSTEM: System = portable
+OTHER = str(Path(__file__).with_name("other_process.py"))
+
+
+@contextmanager
+def serving(name: str = "alpha") -> Iterator[tuple[LocalServer, ServerLog]]:
+    server, log = LocalServer(name), ServerLog()
+    server.start(log)
+    try:
+        yield server, log
+    finally:
+        server.stop()
+
+
+def registration(path: Path) -> Registration:
+    return portable._read(path / "alpha.port")
+
+
+# --- who is let in ---
+
+
+@contextmanager
+def stranger(port: int) -> Iterator[tuple[socket.socket, bytes]]:
+    """Connect without a word; return the server's nonce."""
+    with socket.create_connection(("127.0.0.1", port), 5) as sock:
+        nonce = sock.recv(1000)
+        assert len(nonce) == 32
+        yield sock, nonce
+
+
+def proof(ours: Registration, nonce: bytes, version: int = 1, mac: bytes | None = None) -> bytes:
+    said = b"skyloop client" + struct.pack("<HI", version, 7) + nonce + bytes(32)
+    mac = hmac.digest(ours.secret, said, hashlib.sha256) if mac is None else mac
+    return struct.pack("<4sHI32s32s", b"SKYL", version, 7, bytes(32), mac)
+
+
+def test_a_proof_as_the_page_says_is_accepted(runtime_dir: Path) -> None:
+    with serving() as (_, log):
+        ours = registration(runtime_dir)
+        with stranger(ours.port) as (sock, nonce):
+            sock.send(proof(ours, nonce))
+            said = b"skyloop server" + struct.pack("<HI", 1, 7) + nonce + bytes(32)
+            assert sock.recv(1000) == hmac.digest(ours.secret, said, hashlib.sha256)
+            hello = packets.hello()
+            sock.send(len(hello).to_bytes(4, "little") + hello)
+            wait_until(lambda: log.joined, "it joined")
+            assert log.joined[0].address.startswith("pid 7 (")
+        wait_until(lambda: log.left, "it left")
+        assert log.refusals == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "complaint"),
+    [
+        ("wrong secret", "does not know the proxy's secret"),
+        ("replayed", "does not know the proxy's secret"),
+        ("old version", "does not speak version 1 of the local transport's handshake"),
+        ("garbage", "does not speak"),
+        ("little garbage", "did not prove within 0.05 s"),
+        ("slow", "did not prove within 0.05 s"),
+        ("silent", "did not prove within 0.05 s"),
+    ],
+)
+def test_strangers_are_turned_away_without_a_word(
+    runtime_dir: Path, kind: str, complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if kind in ("slow", "silent", "little garbage"):
+        monkeypatch.setattr(portable, "HANDSHAKE_S", 0.05)
+    with serving() as (_, log):
+        ours = registration(runtime_dir)
+        with stranger(ours.port) as (sock, nonce):
+            said = {
+                "wrong secret": proof(ours._replace(secret=bytes(32)), nonce),
+                "replayed": proof(ours, bytes(32)),
+                "old version": proof(ours, nonce, version=0),
+                "garbage": b"GET / HTTP/1.1\r\n" * 10,
+                "little garbage": b"\xff" * 10,
+                "slow": proof(ours, nonce)[:-1],
+                "silent": b"",
+            }[kind]
+            sock.send(said)
+            with suppress(ConnectionResetError):  # it had not read everything
+                assert sock.recv(1000) == b""
+        wait_until(lambda: log.refusals, "it is reported")
+        (peer, reason) = log.refusals[0]
+        assert peer is NOBODY
+        assert complaint in reason
+        assert log.joined == []
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "others are let in")
+        client.close()
+
+
+def test_a_program_that_only_looks_is_no_stranger(runtime_dir: Path) -> None:
+    with serving() as (_, log):
+        with stranger(registration(runtime_dir).port):
+            pass
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "others are let in")
+        client.close()
+        assert log.refusals == []
+
+
+def test_silent_strangers_keep_no_one_out(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portable, "MAX_STRANGERS", 3)
+    with serving() as (_, log):
+        port = registration(runtime_dir).port
+        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(5)]
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "it is let in")
+        client.close()
+        assert [reason.rpartition(": ")[2] for _, reason in log.refusals] == ["others wanted to connect"] * 3
+        for sock in silent:
+            sock.close()
+
+
+def test_the_server_listens_on_the_loopback_interface_only(runtime_dir: Path) -> None:
+    with serving():
+        listening = Path("/proc/net/tcp").read_text() + Path("/proc/net/tcp6").read_text()
+        port = f":{registration(runtime_dir).port:04X} "
+        assert [line.split()[1] for line in listening.splitlines() if port in line and " 0A " in line] == [
+            f"0100007F{port.strip()}"
+        ]
+
+
+def test_an_impostor_at_the_port_is_refused_and_learns_nothing(runtime_dir: Path) -> None:
+    """A program that listens at the port of the registration, without the secret."""
+    with serving(), socket.create_server(("127.0.0.1", 0)) as impostor:
+        path = runtime_dir / "alpha.port"
+        ours = registration(runtime_dir)
+        content = bytearray(path.read_bytes())
+        struct.pack_into("<H", content, 10, impostor.getsockname()[1])
+        with path.open("r+b") as file:
+            file.write(content)
+        assert registration(runtime_dir) == ours._replace(port=impostor.getsockname()[1])
+        heard: list[bytes] = []
+
+        def answer() -> None:
+            sock, _ = impostor.accept()
+            with sock:
+                sock.send(bytes(32))
+                heard.append(sock.recv(1000))
+                sock.send(bytes(32))
+                sock.recv(1)
+
+        thread = threading.Thread(target=answer)
+        thread.start()
+        with pytest.raises(LinkError, match="the process at its port is not this proxy"):
+            dial("alpha")(ClientLog())
+        thread.join()
+        assert len(heard[0]) == 74
+        assert ours.secret not in heard[0]
+
+
+@pytest.mark.parametrize("damage", ["short", "version"])
+def test_a_registration_of_another_version_is_refused(runtime_dir: Path, damage: str) -> None:
+    with serving():
+        path = runtime_dir / "alpha.port"
+        content = path.read_bytes()
+        with path.open("r+b") as file:
+            if damage == "short":
+                file.truncate(20)
+            else:
+                file.write(content[:8] + b"\x09\0")
+        with pytest.raises(LinkError, match=r"not complete|not of version 1"):
+            dial("alpha")(ClientLog())
+        assert [(proxy.name, proxy.pid) for proxy in list_names()] == [("alpha", None)]
+
+
+def test_a_stopped_proxy_does_not_block_a_caller() -> None:
+    with process("serve") as child:
+        child.send_signal(signal.SIGSTOP)
+        wait_until(lambda: Path(f"/proc/{child.pid}/stat").read_text().split()[2] == "T", "it is stopped")
+        began = time.monotonic()
+        with pytest.raises(LinkError, match="does not accept"):
+            dial("alpha")(ClientLog())
+        assert time.monotonic() - began < 6.0
+        assert [proxy.name for proxy in list_names()] == ["alpha"], "it is listed, although busy"
+
+
+def test_a_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    import grp
+
+    server = LocalServer("alpha", group=grp.getgrgid(os.getegid()).gr_name)
+    with pytest.raises(UsageError, match="a group can't share proxies over the portable transport"):
+        server.start(ServerLog())
+
+
+AS_NOBODY = """
+import os, socket, sys
+from _posixshmem import shm_open
+os.setgroups([])
+os.setgid(65534)
+os.setuid(65534)
+for read in (lambda: open(sys.argv[1], "rb"), lambda: shm_open("/" + sys.argv[3], os.O_RDONLY, mode=0)):
+    try:
+        read()
+    except PermissionError:
+        print("refused")
+sock = socket.socket()
+sock.connect(("127.0.0.1", int(sys.argv[2])))
+sock.sendall(sock.recv(100) * 4)
+try:
+    print(sock.recv(100))
+except ConnectionResetError:
+    print(b"")
+"""
+
+
+@pytest.mark.process
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> None:
+    there = ClientLog()
+    with serving() as (server, log):
+        client = dial("alpha")(there)
+        client.subscribe(video(FRONT))
+        wait_until(lambda: server.subscribers(video(FRONT)), "it watches")
+        server.publish_frame(header(1), picture(header(1)))
+        wait_until(lambda: there.frames, "there is a frame")
+        runtime_dir.parent.chmod(0o755)
+        runtime_dir.chmod(0o755)  # even if they could enter
+        (memory,) = named(named_memory.prefix())
+        command = [sys.executable, "-c", AS_NOBODY, str(runtime_dir / "alpha.port")]
+        ended = subprocess.run(
+            [*command, str(registration(runtime_dir).port), memory],
+            capture_output=True,
+            text=True,
+            timeout=20,
+            check=False,
+        )
+        assert ended.returncode == 0, ended.stderr
+        assert ended.stdout.splitlines() == ["refused", "refused", "b''"]
+        wait_until(lambda: log.refusals, "it is reported")
+        assert len(log.joined) == 1
+        runtime_dir.chmod(0o700)
+        client.close()
+
+
+# --- packets in pieces ---
+
+
+@pytest.fixture
+def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[StreamSocket, StreamSocket, socket.socket]]:
+    """Two ends, and the raw socket of the first."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        portable._limit_received(listener)
+        raw = socket.create_connection(listener.getsockname())
+        there, _ = listener.accept()
+    ends = [StreamSocket(sock, Credentials(1, 1, 1)) for sock in (raw, there)]
+    for end in ends:
+        end.limit_backlog()
+        end.limit_wait(5.0)
+    yield ends[0], ends[1], ends[0]._socket
+    for end in ends:
+        end.close()
+
+
+def is_refused(call: Callable[[], object]) -> bool:
+    try:
+        call()
+    except BlockingIOError:
+        return True
+    return False
+
+
+Pair = tuple[StreamSocket, StreamSocket, socket.socket]
+
+
+def test_a_packet_in_pieces_arrives_whole(pair: Pair) -> None:
+    _, there, raw = pair
+    for cut in (1, 3, 4, 5, 8):
+        content = (6).to_bytes(4, "little") + b"packet"
+        raw.send(content[:cut])
+        for _ in range(2):
+            assert is_refused(lambda: there.recv(100, 1))
+        raw.send(content[cut:] + (3).to_bytes(4, "little") + b"end")
+        assert there.recv(100) == b"packet"
+        assert there.recv(100) == b"end"
+    with pytest.raises(BlockingIOError):
+        there.recv(100, 1)
+    raw.shutdown(socket.SHUT_WR)
+    assert there.recv(100) == b""
+    assert there.recv(100, 1) == b""
+
+
+def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> None:
+    here, there, _ = pair
+    packet, sent = os.urandom(MAX_PACKET), 0
+    began = time.monotonic()
+    while not is_refused(lambda: here.send(packet)):
+        sent += 1
+    assert time.monotonic() - began < 2.0
+    assert 1 <= sent <= 8, "the backlog is bounded"
+    assert here._rest, "the last one was sent in part"
+    with pytest.raises(BlockingIOError):
+        here.post(b"another")
+    assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
+    with pytest.raises(BlockingIOError):
+        there.recv(MAX_PACKET, 1)
+    wait_until(lambda: not here._rest, "it is complete")
+    here.send(b"another")
+    assert there.recv(100) == b"another"
+
+
+def test_a_rest_ends_with_its_connection(pair: Pair) -> None:
+    here, _, _ = pair
+    while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
+        pass
+    here.hang_up(b"bye")
+    wait_until(lambda: not is_refused(lambda: here.recv(100)), "the connection has ended")
+    assert here.recv(100) == b""
+
+
+def test_a_stalled_readers_backlog_is_bounded(pair: Pair) -> None:
+    here, there, _ = pair
+    sent = 0
+    while not is_refused(lambda: here.send(sent.to_bytes(300, "little"))):  # noqa: B023
+        sent += 1
+    assert 32 < sent < 300
+    for number in range(sent):
+        assert there.recv(300) == number.to_bytes(300, "little")
+
+
+def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
+    """The garbage collector and signals' handlers may send at any point of another call."""
+    here, there, raw = pair
+
+    class Interrupted:
+        def send(self, content: bytes) -> int:
+            with pytest.raises(BlockingIOError):
+                here.post(b"inside")
+            with pytest.raises(BlockingIOError):
+                here.send(b"inside")
+            return raw.send(content)
+
+    here._socket = Interrupted()  # type: ignore[assignment]
+    here.send(b"outside")
+    here._socket = raw
+    assert there.recv(100) == b"outside"
+    with here._sending:
+        refused: list[bool] = []
+        thread = threading.Thread(target=lambda: refused.append(is_refused(lambda: here.post(b"x"))))
+        thread.start()
+        thread.join()
+        assert refused == [True], "it waits for no lock"
+    with pytest.raises(BlockingIOError):
+        there.recv(100, 1)
+
+
+@pytest.mark.parametrize("length", [0, 65_537, 0xFFFFFFFF])
+def test_an_impossible_length_ends_the_connection(pair: Pair, length: int) -> None:
+    _, there, raw = pair
+    raw.send(length.to_bytes(4, "little") + bytes(100))
+    assert there.recv(100) == b""
+    assert there.recv(100) == b""
+
+
+def test_waiting_ends_in_time(pair: Pair) -> None:
+    here, there, _ = pair
+    there.limit_wait(0.05)
+    began = time.monotonic()
+    with pytest.raises(BlockingIOError):
+        there.recv(100)
+    assert 0.04 < time.monotonic() - began < 2.0
+    there.limit_wait(0.0)
+    waker = threading.Timer(0.05, there.hang_up)
+    waker.start()
+    assert there.recv(100) == b""
+    assert here.recv(100) == b""
+
+
+def test_select_does_what_the_other_selectors_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What Windows has."""
+    monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
+    poller = portable.SelectorPoller()
+    one, two = socket.socketpair()
+    with one, two:
+        poller.register(one.fileno())
+        assert poller.poll(5.0) == [(poller.waker, selectors.EVENT_READ)], "it notices the new socket"
+        poller.drain()
+        poller.drain()
+        two.send(b"x")
+        assert poller.poll(5.0) == [(one.fileno(), selectors.EVENT_READ)]
+        poller.mute(one.fileno(), True)
+        poller.mute(one.fileno(), True)
+        assert poller.poll(0) == []
+        poller.mute(one.fileno(), False)
+        poller.drain()
+        assert poller.poll(5.0) == [(one.fileno(), selectors.EVENT_READ)]
+        one.close()  # without a word
+        assert poller.poll(0) == []
+    poller.close()
+    poller.wake()
+    poller.unregister(1)
+
+
+# --- killed processes ---
+
+
+@contextmanager
+def process(role: str, name: str = "alpha") -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, OTHER, role, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        text=True,
+    ) as child:  # fmt: skip
+        try:
+            assert child.stdout is not None
+            assert child.stdout.readline() == "ready\n"
+            yield child
+        finally:
+            child.kill()
+
+
+def named(begin: str = "sky-") -> list[str]:
+    return [path.name for path in Path("/dev/shm").iterdir() if path.name.startswith(begin)]
+
+
+def keeper_of(begin: str) -> list[int]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            words = path.read_bytes().split(b"\0")
+        except OSError:
+            continue
+        if begin.encode() in words:
+            found.append(int(path.parent.name))
+    return found
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("killed", ["proxy", "client", "both"])
+@pytest.mark.parametrize("_number", range(2))
+def test_a_killed_process_leaves_no_memory_and_no_child(runtime_dir: Path, killed: str, _number: int) -> None:
+    log = ClientLog(keep=False)
+    with process("serve") as proxy:
+        begin = registration(runtime_dir).memory
+        client = dial("alpha")(log)
+        client.subscribe(video(FRONT))
+        with process("watch") as watching:
+            wait_until(lambda: log.seen and len(named(begin)) >= 1 and keeper_of(begin), "frames flow")
+            if killed in ("client", "both"):
+                watching.kill()
+            if killed in ("proxy", "both"):
+                proxy.kill()
+                client.close()
+                wait_within(5.0, lambda: not named(begin) and not keeper_of(begin))
+                assert proxy.stderr is not None
+                assert proxy.stderr.read() == ""
+            else:
+                number = len(log.seen)
+                wait_until(lambda: len(log.seen) > number + 50, "the others still get frames")
+                assert log.torn == []
+                client.close()
+                wait_within(5.0, lambda: not named(begin))
+                assert proxy.stdin is not None
+                proxy.stdin.close()
+                assert proxy.wait() == 0
+                wait_within(5.0, lambda: not keeper_of(begin))
+    assert named(begin) == []
+
+
+def wait_within(seconds: float, condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+@pytest.mark.process
+def test_memory_of_a_proxy_killed_with_its_keeper_is_removed_by_the_next_listing(runtime_dir: Path) -> None:
+    with process("serve") as proxy:
+        begin = registration(runtime_dir).memory
+        client = dial("alpha")(ClientLog())
+        client.subscribe(video(FRONT))
+        wait_until(lambda: named(begin) and keeper_of(begin), "frames flow")
+        for pid in keeper_of(begin):
+            os.kill(pid, signal.SIGKILL)
+        proxy.kill()
+        proxy.wait()
+        client.close()
+        assert named(begin) != []
+        wait_within(5.0, lambda: not list_names())  # it may be starting another keeper, which holds its lock until then
+        assert named(begin) == []
+
+
+@pytest.mark.process
+def test_a_killed_keeper_is_replaced(runtime_dir: Path) -> None:
+    with process("serve") as proxy:
+        begin = registration(runtime_dir).memory
+        first = ClientLog(keep=False)
+        client = dial("alpha")(first)
+        client.subscribe(video(FRONT))
+        wait_until(lambda: keeper_of(begin), "frames flow")
+        (killed,) = keeper_of(begin)
+        os.kill(killed, signal.SIGKILL)
+        client.close()
+        client = dial("alpha")(first)
+        client.subscribe(video(FRONT))
+        wait_until(lambda: [pid for pid in keeper_of(begin) if pid != killed], "the next slot starts another one")
+        client.close()
+        proxy.kill()
+        wait_within(5.0, lambda: not named(begin))
+
+
+def test_an_ending_server_leaves_the_memory_of_others_in_its_process() -> None:
+    """Its name is free for a moment before its file is gone, and others may look at it then."""
+    there = ClientLog()
+    with serving("bravo") as (bravo, _):
+        client = dial("bravo")(there)
+        client.subscribe(video(FRONT))
+        wait_until(lambda: bravo.subscribers(video(FRONT)), "it watches")
+        bravo.publish_frame(header(1), picture(header(1)))
+        wait_until(lambda: there.frames, "there is a frame")
+        before = named(named_memory.prefix())
+        with serving("alpha"):
+            pass
+        assert list_names()[0].name == "bravo"
+        assert named(named_memory.prefix()) == before
+        client.close()
+
+
+def test_slots_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    named_memory.prefix()
+    monkeypatch.setattr(named_memory._process, "free", type(named_memory._process.free)([5]))
+    slot = named_memory.NamedSlot(1, 0, 100)
+    with pytest.raises(OSError, match="slots"):
+        named_memory.NamedSlot(2, 0, 100)
+    assert len(named(named_memory.prefix())) == 1
+    del slot
+    assert named(named_memory.prefix()) == []
+    named_memory.NamedSlot(3, 0, 100)
+
+
+def test_a_forks_copy_of_a_slot_removes_nothing() -> None:
+    import warnings
+
+    slot = named_memory.NamedSlot(1, 0, 100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12
+        child = os.fork()
+    if child == 0:
+        mine = named_memory.prefix()
+        slot.__del__()
+        os._exit(mine == slot._owner.prefix)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert named(slot._name) == [slot._name]
