@@ -8,7 +8,6 @@ Modules that another system lacks are imported where they are used.
 from __future__ import annotations
 
 import asyncio
-import errno
 import math
 import os
 import select
@@ -155,40 +154,46 @@ def sees_peers() -> bool:
 
 
 def lock_file(descriptor: int, timeout_s: float | None) -> bool:
-    """Lock an open file against other processes until it is closed, or its process ends in whatever way.
-
-    ``timeout_s``: how long to wait for another process [s]; None for as long as necessary. Return False after that.
-    """
-    deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-    while not _locked_now(descriptor):
-        if deadline_s is not None and time.monotonic() > deadline_s:
+    """Lock an open file as :func:`try_lock` does, waiting for others for up to ``timeout_s`` [s] (None: no limit)."""
+    deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
+    while not try_lock(descriptor):
+        if time.monotonic() > deadline_s:
             return False
         time.sleep(_POLL_S)
     return True
 
 
-def _locked_now(descriptor: int) -> bool:
+def try_lock(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open file until it is closed or the process ends; return False if another one holds it.
+
+    On Windows all locks are exclusive. There, the lock covers a byte behind the content, which stays readable.
+    """
+    if sys.platform != "win32":
+        import fcntl
+
+        try:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+    import msvcrt
+
+    os.lseek(descriptor, 1 << 30, os.SEEK_SET)
     try:
-        if sys.platform != "win32":
-            import fcntl
-
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        else:
-            import msvcrt
-
-            # One byte, beyond the end of any file that is locked, so that the lock keeps no one from reading.
-            os.lseek(descriptor, 1 << 30, os.SEEK_SET)
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    except OSError as error:
-        if error.errno not in (errno.EAGAIN, errno.EACCES, errno.EDEADLK):
-            raise
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    except PermissionError:
         return False
     return True
 
 
+def own_uid() -> int:
+    """Return this process's effective user; 0 on Windows, which has no such numbers."""
+    return 0 if sys.platform == "win32" else os.geteuid()
+
+
 def is_own_user(user: int | None, *, or_root: bool = False) -> bool:
     """Return whether a user id is this process's own. Windows has no such ids: there, no one is anyone."""
-    return sys.platform != "win32" and (user == os.geteuid() or (or_root and user == 0))
+    return sys.platform != "win32" and (user == own_uid() or (or_root and user == 0))
 
 
 def is_open_to_others(mode: int) -> bool:

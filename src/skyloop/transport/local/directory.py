@@ -19,23 +19,21 @@ import functools
 import os
 import stat
 import sys
-import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from skyloop.errors import LinkError, NameTakenError, UsageError
+from skyloop.platform import lock_file, own_uid
 from skyloop.transport.base import NAME, check_name
 from skyloop.transport.local.system import (
     PROXY,
     Listener,
     PacketSocket,
     System,
-    own_uid,
     serving_side,
     systems,
-    try_lock,
     user_name,
 )
 
@@ -282,8 +280,5 @@ def directory_owner(path: Path) -> int | None:
 
 
 def _lock(descriptor: int, path: Path, timeout_s: float) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not try_lock(descriptor):
-        if time.monotonic() > deadline:
-            raise LinkError(f"{path} is locked by another process, which appears to be stopped")
-        time.sleep(0.005)
+    if not lock_file(descriptor, timeout_s):
+        raise LinkError(f"{path} is locked by another process, which appears to be stopped")

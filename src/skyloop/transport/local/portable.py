@@ -35,6 +35,7 @@ from typing import Any, Final, NamedTuple
 
 from skyloop.child_process import leave_to_parent
 from skyloop.errors import LinkError, UsageError
+from skyloop.platform import lock_file, own_uid, try_lock
 from skyloop.transport.base import Pixels
 from skyloop.transport.local.named_memory import NamedSlot, prefix, remove_names
 from skyloop.transport.local.system import (
@@ -44,8 +45,6 @@ from skyloop.transport.local.system import (
     Credentials,
     PacketSocket,
     StrangerError,
-    own_uid,
-    try_lock,
 )
 
 SUFFIXES: Final = {PROXY: ".port", HOST: ".hostport"}
@@ -361,13 +360,10 @@ def _register(path: Path, registration: Registration) -> int:
         Path(part).unlink(missing_ok=True)
         raise
     descriptor = os.open(path, os.O_RDWR)
-    deadline_s = time.monotonic() + _LOCKED_WITHIN_S
-    while not try_lock(descriptor):  # others hold it for a moment when they look
-        if time.monotonic() > deadline_s:
-            os.close(descriptor)
-            path.unlink(missing_ok=True)
-            raise LinkError(f"{path} is locked by another process, which appears to be stopped")
-        time.sleep(0.005)
+    if not lock_file(descriptor, _LOCKED_WITHIN_S):  # others hold it for a moment when they look
+        os.close(descriptor)
+        path.unlink(missing_ok=True)
+        raise LinkError(f"{path} is locked by another process, which appears to be stopped")
     return descriptor
 
 

@@ -14,6 +14,7 @@ from typing import Final
 
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
+from skyloop.platform import own_uid
 from skyloop.transport.base import (
     MAX_PACKET,
     MAX_SUBSCRIPTIONS,
@@ -39,7 +40,6 @@ from skyloop.transport.local.system import (
     Listener,
     PacketSocket,
     StrangerError,
-    own_uid,
     user_name,
 )
 from skyloop.transport.priority import MOST_PACKETS, SUPERSEDED, Lane, PacketBacklog, PriorityLock, is_command

@@ -187,33 +187,3 @@ def user_name(uid: int) -> str:
         except KeyError:
             return f"uid {uid}"
     return os.environ.get("USERNAME") or f"uid {uid}"
-
-
-def own_uid() -> int:
-    """Return this process's effective user; 0 on Windows, which has no such numbers."""
-    if sys.platform == "win32":
-        return 0
-    return os.geteuid()
-
-
-def try_lock(descriptor: int, *, shared: bool = False) -> bool:
-    """Lock an open file until it is closed or the process ends; return False if another one holds it.
-
-    On Windows all locks are exclusive. There, the lock covers a byte behind the content, which stays readable.
-    """
-    if sys.platform != "win32":
-        import fcntl
-
-        try:
-            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True
-    import msvcrt
-
-    os.lseek(descriptor, 1 << 30, os.SEEK_SET)
-    try:
-        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-    except PermissionError:
-        return False
-    return True
