@@ -60,6 +60,8 @@ check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy --platform win32 --cache-dir .mypy_cache/win32 src/skyloop
+	$(BIN)/mypy --platform darwin --cache-dir .mypy_cache/darwin src/skyloop
 	$(BIN)/lint-imports
 	$(BIN)/python scripts/house.py --check
 	$(BIN)/python scripts/paths.py --check

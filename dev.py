@@ -26,7 +26,7 @@ PYTHON = ENVIRONMENT / ("Scripts/python.exe" if os.name == "nt" else "bin/python
 LOCK = "requirements-dev.lock"
 DEMO = ENVIRONMENT / ".installed"  #: stamp: what the demo needs is installed, in the state of these files
 DEV = ENVIRONMENT / ".installed-dev"  #: stamp: what the tests need, too
-NEEDS = {DEMO: ["pyproject.toml"], DEV: [DEMO, "requirements-dev.txt", LOCK]}
+NEEDS: dict[Path, Sequence[str | Path]] = {DEMO: ["pyproject.toml"], DEV: [DEMO, "requirements-dev.txt", LOCK]}
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -93,7 +93,9 @@ def is_old(stamp: Path) -> bool:
 def pip(*arguments: str) -> None:
     """Install packages: the newest that fit or, with ``LOCKED=1``, exactly the versions in the lock file."""
     locked = ["--constraint", LOCK] if os.environ.get("LOCKED") else []
-    subprocess.run([PYTHON, "-m", "pip", "install", "--disable-pip-version-check", *locked, *arguments], check=True)
+    subprocess.run(
+        [str(PYTHON), "-m", "pip", "install", "--disable-pip-version-check", *locked, *arguments], check=True
+    )
 
 
 @contextmanager

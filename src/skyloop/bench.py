@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from importlib import metadata
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
 import numpy as np
@@ -34,7 +34,7 @@ from skyloop.client import Drone, Frame, connect
 from skyloop.client.video import VideoOptions
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import parse_uri
-from skyloop.errors import LinkError, NoAnswerError
+from skyloop.errors import LinkError, NoAnswerError, UnsupportedError
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
@@ -293,6 +293,7 @@ class Application:
 
 _STAMP: Final = struct.Struct("<qqq")  # sending time, columns, rows
 _PACKET: Final = struct.Struct("<qqq3d52x")  # a stamp of size 0, three numbers, and padding to 100 bytes as in Skyloop
+_LINUX: Any = socket  # with what other systems lack, as their type checkers know
 _MEMORY_BYTES: Final = LARGEST[0] * LARGEST[1] * 3
 
 
@@ -306,11 +307,11 @@ class BareVehicle:
 
     def __init__(self, folder: str, received: Received) -> None:
         self._path = Path(folder) / "floor"
-        self._descriptor = os.memfd_create("skyloop-bench-floor")
+        self._descriptor = cast("Any", os).memfd_create("skyloop-bench-floor")
         os.ftruncate(self._descriptor, _MEMORY_BYTES)
         self._memory = np.frombuffer(mmap.mmap(self._descriptor, _MEMORY_BYTES), np.uint8)
         self._memory[:] = 1  # map the pages in advance: Skyloop's slots also stay mapped after their first use
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener = socket.socket(_LINUX.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
         self._received = received
@@ -339,7 +340,7 @@ class BareVehicle:
         except OSError:
             return  # closed before a connection was made
         with self._socket as sock:
-            socket.send_fds(sock, [b"memory"], [self._descriptor])
+            _LINUX.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
                 self._received(COMMAND, _STAMP.unpack_from(packet)[0])
 
@@ -348,10 +349,10 @@ class BareApplication:
     """The other end of :class:`BareVehicle`; arguments and methods are those of :class:`Application`."""
 
     def __init__(self, folder: str, received: Received) -> None:
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket = socket.socket(_LINUX.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(Path(folder) / "floor"))
-        _, (descriptor, *_), _, _ = socket.recv_fds(self._socket, 16, 1)
-        self._memory = mmap.mmap(descriptor, _MEMORY_BYTES, prot=mmap.PROT_READ)
+        _, (descriptor, *_), _, _ = _LINUX.recv_fds(self._socket, 16, 1)
+        self._memory = mmap.mmap(descriptor, _MEMORY_BYTES, access=mmap.ACCESS_READ)
         os.close(descriptor)
         self._received = received
         self._thread = threading.Thread(target=self._receive, name="floor-receive", daemon=True)
@@ -440,8 +441,11 @@ def measure_delays(
     """Measure Skyloop and a bare connection in turn, each between two processes.
 
     Each measurement takes ``seconds`` for each frame size (width and height, at most :data:`LARGEST`). Raises
-    :class:`LinkError` if the processes do not find each other, or if nothing arrives.
+    :class:`LinkError` if the processes do not find each other, or if nothing arrives, and :class:`UnsupportedError` on
+    systems without the sockets of the bare connection.
     """
+    if not hasattr(socket, "send_fds"):
+        raise UnsupportedError("the delays are measured next to a bare connection that needs Linux; try: bench sim")
     machine, rounds = Machine.here(), max(1, round(seconds / _TURN_S))
     turns = [_Turn(number, seconds / rounds, size) for number in range(rounds) for size in sizes]
     found: dict[tuple[str, tuple[int, int], str], list[int]] = {}
@@ -474,7 +478,7 @@ class _Pair:
 
     def __init__(self, kind: str, folder: str) -> None:
         self._kind = kind
-        self._pipes: list[Connection] = []
+        self._pipes: list[Any] = []  # connections
         self._processes: list[ChildProcess] = []
         for side in ("vehicle", "application"):
             ours, theirs = multiprocessing.Pipe()

@@ -188,7 +188,9 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
 
 def own_uid() -> int:
     """Return this process's effective user; 0 on Windows, which has no such numbers."""
-    return 0 if sys.platform == "win32" else os.geteuid()
+    if sys.platform == "win32":
+        return 0
+    return os.geteuid()
 
 
 def is_own_user(user: int | None, *, or_root: bool = False) -> bool:

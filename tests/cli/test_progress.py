@@ -81,7 +81,10 @@ def test_cameras_are_listed_by_name_and_node(tmp_path: Path) -> None:
         tmp_path, video10=("Another", "0"), video2=("HD Webcam", "0"), video3=("HD Webcam", "1"), v4l=("no node", "0")
     )
     found = cameras(system, devices)
-    assert [(camera.path.name, camera.name) for camera in found] == [("video2", "HD Webcam"), ("video10", "Another")]
+    assert [(Path(camera.path).name, camera.name) for camera in found] == [
+        ("video2", "HD Webcam"),
+        ("video10", "Another"),
+    ]
     assert described(found).startswith(f"cameras of this machine: video://{devices}/video2 (HD Webcam), video://")
     assert cameras(tmp_path / "none", devices) == []
     assert described([]) == "no camera is connected to this machine"

@@ -364,7 +364,7 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
 
     here._socket = Interrupted()  # type: ignore[assignment]
     here.send(b"outside")
-    here._socket = raw
+    here._socket = raw  # type: ignore[assignment]
     assert there.recv(100) == b"outside"
     with here._sending:
         refused: list[bool] = []
