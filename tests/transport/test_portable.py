@@ -269,7 +269,7 @@ def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> 
 
 
 @pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[StreamSocket, StreamSocket, socket.socket]]:
+def pair() -> Iterator[Pair]:
     """Two ends, and the raw socket of the first."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         portable._limit_received(listener)
@@ -292,7 +292,7 @@ def is_refused(call: Callable[[], object]) -> bool:
     return False
 
 
-Pair = tuple[StreamSocket, StreamSocket, socket.socket]
+Pair = tuple[StreamSocket, StreamSocket, portable._TcpSocket]
 
 
 def test_a_packet_in_pieces_arrives_whole(pair: Pair) -> None:
