@@ -19,6 +19,7 @@ SAMPLES: list[tuple[bytes, packets.Message]] = [
     (packets.subscribe("feedback", False), packets.Subscribe("feedback", False)),
     (packets.release(7), packets.Release(7)),
     (packets.slot(3, 1, 1 << 40), packets.Slot(3, 1, 1 << 40)),
+    (packets.named_slot(3, 1, 1 << 40, "sky-0-f"), packets.NamedSlot(3, 1, 1 << 40, "sky-0-f")),
     (packets.frame(9, encode(HEAD)), packets.Frame(9, HEAD)),
     (packets.retire(1, 4), packets.Retire(1, 4)),
     (packets.bye("because"), packets.Bye("because")),
@@ -53,6 +54,10 @@ def test_truncated_is_refused(packet: bytes, _: packets.Message) -> None:
         (0x44, b"\0\0"),
         (0x45, b""),
         (0x47, b""),
+        (0x48, bytes(16)),
+        (0x48, bytes(16) + b"../etc"),
+        (0x48, bytes(16) + b"x" * 31),
+        (0x48, bytes(16) + b"\xff"),
         (0xFF, b"1234"),
     ],
 )

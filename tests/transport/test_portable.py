@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import itertools
 import os
 import selectors
 import signal
@@ -11,6 +12,7 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +20,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
@@ -269,7 +273,7 @@ def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> 
 
 
 @pytest.fixture
-def pair(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[StreamSocket, StreamSocket, socket.socket]]:
+def pair() -> Iterator[Pair]:
     """Two ends, and the raw socket of the first."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         portable._limit_received(listener)
@@ -292,7 +296,7 @@ def is_refused(call: Callable[[], object]) -> bool:
     return False
 
 
-Pair = tuple[StreamSocket, StreamSocket, socket.socket]
+Pair = tuple[StreamSocket, StreamSocket, portable._TcpSocket]
 
 
 def test_a_packet_in_pieces_arrives_whole(pair: Pair) -> None:
@@ -310,6 +314,67 @@ def test_a_packet_in_pieces_arrives_whole(pair: Pair) -> None:
     raw.shutdown(socket.SHUT_WR)
     assert there.recv(100) == b""
     assert there.recv(100, 1) == b""
+
+
+class Pieces(socket.socket):
+    """A socket that receives a piece more whenever nothing is left of what came before."""
+
+    def __init__(self, pieces: list[bytes]) -> None:
+        super().__init__()
+        self._pieces, self._arrived = pieces, b""
+
+    def recv(self, size: int, flags: int = 0) -> bytes:  # type: ignore[override]
+        if not self._arrived:
+            if not self._pieces:
+                return b""
+            self._arrived = self._pieces.pop(0)
+            raise BlockingIOError
+        found = self._arrived[:size]
+        if not flags & socket.MSG_PEEK:
+            self._arrived = self._arrived[size:]
+        return found
+
+
+@given(st.lists(st.binary(min_size=1, max_size=300), max_size=8), st.lists(st.integers(0, 2000), max_size=12))
+def test_packets_cut_anywhere_arrive_whole(sent: list[bytes], cuts: list[int]) -> None:
+    content = b"".join(len(packet).to_bytes(4, "little") + packet for packet in sent)
+    places = sorted({0, len(content), *(cut for cut in cuts if cut < len(content))})
+    pieces = [content[begin:end] for begin, end in itertools.pairwise(places)]
+    with socket.socket() as unused, Pieces(pieces) as raw:
+        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end._socket.close()
+        end._socket = raw  # type: ignore[assignment]
+        received: list[bytes] = []
+        while b"" not in received:
+            with suppress(BlockingIOError):
+                received.append(end.recv(300, 1))
+    assert received == [*sent, b""]
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_packets_or_the_end(content: bytes) -> None:
+    with socket.socket() as unused, Pieces([content] if content else []) as raw:
+        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end._socket.close()
+        end._socket = raw  # type: ignore[assignment]
+        for _ in range(60):
+            with suppress(BlockingIOError):
+                if not end.recv(300, 1):
+                    return
+    raise AssertionError("it has no end")
+
+
+@given(st.binary(max_size=120) | st.binary(max_size=70).map(lambda tail: b"SkyPort\n\1\0" + tail))
+def test_any_file_is_a_registration_or_an_error(content: bytes) -> None:
+    with tempfile.NamedTemporaryFile(suffix=".port") as file:
+        file.write(content)
+        file.flush()
+        try:
+            found = portable._read(Path(file.name))
+        except OSError:
+            return
+        assert len(found.secret) == 32
+        named_memory.remove_names("not a prefix/../")
 
 
 def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> None:

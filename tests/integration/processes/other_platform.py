@@ -59,7 +59,7 @@ def pretend(platform: str) -> None:
             delattr(os, name)
     if platform == "win32":
         sys.modules["msvcrt"] = locking
-        mmap.mmap = TaggedMemory  # type: ignore[misc, assignment]
+        mmap.mmap = TaggedMemory  # type: ignore[assignment,misc]
     sys.platform = platform
 
 

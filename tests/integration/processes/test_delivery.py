@@ -98,4 +98,4 @@ def test_a_thousand_connections_leave_nothing_behind(proxy: Callable[..., Proces
     assert resources()[2] <= before[2] + 4
     assert count("/proc/self/fd") <= own_before
     assert threading.active_count() <= threads_before
-    assert {path.suffix for path in sockets.iterdir()} <= {".sock", ".lock", ""}
+    assert {path.suffix for path in sockets.iterdir()} <= {".sock", ".port", ".lock", ""}

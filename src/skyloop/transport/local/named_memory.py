@@ -15,7 +15,6 @@ import errno
 import logging
 import mmap
 import os
-import secrets
 import struct
 import sys
 import threading
@@ -55,7 +54,7 @@ class _Process:
 
     def __init__(self) -> None:
         self.pid = os.getpid()
-        self.prefix = f"sky-{secrets.token_hex(6)}"
+        self.prefix = f"sky-{os.urandom(6).hex()}"
         self.free = deque(range(MOST))  # first in, first out: the names of freed slots rest longest
         self._lock = threading.Lock()
         self._keeper: ChildProcess | None = None

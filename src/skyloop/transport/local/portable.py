@@ -18,7 +18,6 @@ import hmac
 import logging
 import math
 import os
-import secrets
 import select
 import selectors
 import socket
@@ -334,7 +333,7 @@ def listen(path: Path, gid: int | None) -> Gate:
         _limit_received(listener)
         listener.bind((_HOST, 0))
         listener.listen(128)
-        registration = Registration(listener.getsockname()[1], os.getpid(), secrets.token_bytes(32), prefix())
+        registration = Registration(listener.getsockname()[1], os.getpid(), os.urandom(32), prefix())
         return Gate(listener, registration, path, _register(path, registration))
     except BaseException:
         listener.close()
@@ -432,7 +431,7 @@ def connect(path: Path) -> StreamSocket:
 
 def _introduce(sock: socket.socket, registration: Registration, deadline_s: float) -> None:
     """Prove to the server that this end knows the secret, and let the server prove the same."""
-    pid, ours = os.getpid(), secrets.token_bytes(_NONCE)
+    pid, ours = os.getpid(), os.urandom(_NONCE)
     theirs = _receive(sock, _NONCE, deadline_s)
     mac = registration.mac(_CLIENT, theirs, ours, pid)
     sock.sendall(_PROOF.pack(_PROOF_MAGIC, VERSION, pid, ours, mac))
@@ -454,7 +453,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
 def _challenge(sock: socket.socket, registration: Registration, deadline_s: float) -> int:
     """Return the process at the other end if it knows the secret. Raises :class:`StrangerError` if it does not."""
     pid: int
-    ours = secrets.token_bytes(_NONCE)
+    ours = os.urandom(_NONCE)
     sock.sendall(ours)
     magic, version, pid, theirs, mac = _PROOF.unpack(_receive(sock, _PROOF.size, deadline_s))
     if magic != _PROOF_MAGIC or version != VERSION:
