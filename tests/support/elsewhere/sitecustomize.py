@@ -1,0 +1,219 @@
+"""Make Skyloop in this process, and in all its children, believe that it runs on Windows or macOS.
+
+    SKYLOOP_PRETEND=win32 PYTHONPATH=tests/support/elsewhere python -m pytest -m "not slow"
+
+Python imports this module at its start. Modules of ``skyloop``, and only those, get stand-ins for the modules of the
+standard library that differ: names that the other system lacks are missing, and the few that only it has are imitated
+where the imitation is simple (locks, named memory, pipes, ending processes). Libraries and the tests keep the real
+ones. This shows what Skyloop itself needs; it shows nothing about other libraries, paths or file permissions there.
+"""
+
+from __future__ import annotations
+
+import atexit
+import builtins
+import contextlib
+import importlib.abc
+import importlib.machinery
+import mmap
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import types
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+PRETEND = os.environ.get("SKYLOOP_PRETEND", "")
+_LINUX_OS = (
+    "memfd_create", "MFD_CLOEXEC", "MFD_ALLOW_SEALING", "eventfd", "eventfd_read", "eventfd_write", "EFD_CLOEXEC",
+    "EFD_NONBLOCK", "posix_fallocate", "sched_getaffinity", "sched_setaffinity", "sched_setscheduler", "pidfd_open",
+)  # fmt: skip
+_POSIX_OS = (
+    "fork", "register_at_fork", "nice", "getuid", "geteuid", "getgid", "getegid", "getgroups", "chown", "fchown",
+    "fchmod", "killpg", "setsid", "getpgid", "pread", "getloadavg", "uname", "setpriority", "getpriority", "mkfifo",
+    "O_DIRECTORY", "O_NOFOLLOW", "O_CLOEXEC", "O_NONBLOCK", "fpathconf", "openpty", "execv",
+)  # fmt: skip
+_LINUX_SOCKET = ("SO_PEERCRED", "MSG_CMSG_CLOEXEC", "SO_BINDTODEVICE", "SOCK_CLOEXEC")
+_POSIX_SOCKET = (
+    "AF_UNIX", "SCM_RIGHTS", "CMSG_SPACE", "CMSG_LEN", "send_fds", "recv_fds", "MSG_DONTWAIT", "MSG_NOSIGNAL",
+)  # fmt: skip
+_MISSING: Mapping[str, Mapping[str, Sequence[str]]] = {
+    "darwin": {
+        "os": _LINUX_OS,
+        "socket": _LINUX_SOCKET,
+        "select": ("epoll", "EPOLLIN"),
+        "mmap": ("MAP_POPULATE",),
+        "time": ("CLOCK_BOOTTIME",),
+    },
+    "win32": {
+        "os": (*_LINUX_OS, *_POSIX_OS),
+        "socket": (*_LINUX_SOCKET, *_POSIX_SOCKET),
+        "select": ("epoll", "EPOLLIN", "poll", "POLLIN", "POLLOUT"),
+        "mmap": ("MAP_POPULATE", "MAP_SHARED", "PROT_READ", "PROT_WRITE"),
+        "signal": ("SIGKILL", "SIGHUP", "SIGCONT", "SIGSTOP", "SIGUSR1", "SIGUSR2", "SIGQUIT", "pthread_kill"),
+        "time": ("CLOCK_BOOTTIME", "clock_gettime_ns", "clock_gettime"),
+    },
+}
+_ABSENT = {
+    "darwin": frozenset[str](),
+    "win32": frozenset({"curses", "fcntl", "grp", "pty", "pwd", "resource", "termios", "tty", "_posixshmem"}),
+}
+_REAL_NAMES = {"os": os, "socket": socket, "select": select, "mmap": mmap, "signal": signal, "sys": sys}
+
+
+class _StandIn(types.ModuleType):
+    """A module with some names missing and others replaced; everything else is the real module's."""
+
+    def __init__(self, real: types.ModuleType, missing: Sequence[str], **replaced: Any) -> None:
+        super().__init__(real.__name__)
+        self.__dict__.update(_real=real, _missing=frozenset(missing), **replaced)
+
+    def __getattr__(self, name: str) -> Any:
+        if name in self._missing:
+            raise AttributeError(f"module {self.__name__!r} has no attribute {name!r}")
+        return getattr(self._real, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:  # tests replace attributes
+        self.__dict__[name] = value
+        setattr(self._real, name, value)
+
+    def __dir__(self) -> list[str]:
+        return [name for name in dir(self._real) if name not in self._missing]
+
+
+class TaggedMemory(mmap.mmap):
+    """Memory with a name, as on Windows, where it is free when no one uses it any more."""
+
+    def __new__(
+        cls, number: int, length: int, *args: Any, tagname: str = "", access: int = 0, **more: Any
+    ) -> TaggedMemory:
+        if not tagname:
+            return super().__new__(cls, number, length, *args, access=access, **more)
+        path = f"/dev/shm/as-on-windows-{tagname}"
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        if os.fstat(file).st_size == 0:
+            os.ftruncate(file, length)
+            atexit.register(_remove, path)
+        found = super().__new__(cls, file, length, access=access)
+        os.close(file)
+        return found
+
+
+def _remove(path: str) -> None:
+    with contextlib.suppress(FileNotFoundError):
+        Path(path).unlink()
+
+
+class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
+    """Processes have flags, and ending one is the same as killing it."""
+
+    def __init__(self, *args: Any, creationflags: int = 0, **more: Any) -> None:
+        assert not {"start_new_session", "preexec_fn", "process_group", "user"} & more.keys(), "not on Windows"
+        assert not more.get("pass_fds"), "not on Windows"
+        super().__init__(*args, start_new_session=bool(creationflags & 0x200), **more)
+
+    def terminate(self) -> None:
+        self.kill()
+
+    def send_signal(self, sig: int) -> None:
+        if sig == signal.SIGTERM:
+            self.kill()
+        elif sig:
+            raise ValueError(f"unsupported signal: {sig}")
+
+
+def _locking(descriptor: int, mode: int, _: int) -> None:
+    import fcntl
+
+    assert mode == 2
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise PermissionError(*error.args) from None
+
+
+def _peek(handle: Any, _buffer: Any, _size: int, _read: Any, there: Any, _left: Any) -> int:
+    poll = select.poll()
+    poll.register(handle.value, select.POLLIN)
+    ready = dict(poll.poll(0)).get(handle.value, 0)
+    there._obj.value = 1 if ready & select.POLLIN else 0
+    return 0 if ready & select.POLLHUP and not ready & select.POLLIN else 1
+
+
+def _windows() -> dict[str, types.ModuleType]:
+    import asyncio
+    import ctypes
+
+    kernel32 = types.SimpleNamespace(
+        PeekNamedPipe=_peek,
+        GetCurrentThread=lambda: 0,
+        GetCurrentProcess=lambda: 0,
+        SetThreadPriority=lambda *_: 1,
+        SetPriorityClass=lambda *_: 1,
+    )
+    console = types.ModuleType("msvcrt")
+    console.__dict__.update(LK_NBLCK=2, locking=_locking, get_osfhandle=lambda descriptor: descriptor)
+    return {
+        "msvcrt": console,
+        "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
+        "subprocess": _StandIn(subprocess, (), Popen=_WindowsPopen),
+        "asyncio": _StandIn(asyncio, ()),
+    }
+
+
+def stand_ins(system: str) -> dict[str, types.ModuleType]:
+    """Return the modules that Skyloop gets in place of the real ones."""
+    import time
+
+    real = {**_REAL_NAMES, "time": time}
+    found: dict[str, types.ModuleType] = {
+        name: _StandIn(real[name], missing) for name, missing in _MISSING[system].items()
+    }
+    found["sys"] = _StandIn(sys, (), platform=system)
+    if system == "win32":
+        found |= _windows()
+        found["mmap"].__dict__["mmap"] = TaggedMemory
+    return found
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds Skyloop's modules as usual, and gives them an ``import`` that returns the stand-ins."""
+
+    def __init__(self, system: str) -> None:
+        self._found = stand_ins(system)
+        self._absent = _ABSENT[system]
+        self._builtins = {**vars(builtins), "__import__": self._import}
+
+    def find_spec(self, name: str, path: Any, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        if name != "skyloop" and not name.startswith("skyloop."):
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is not None and isinstance(spec.loader, importlib.machinery.SourceFileLoader):
+            real = spec.loader.exec_module
+
+            def exec_module(module: types.ModuleType) -> None:
+                module.__dict__["__builtins__"] = self._builtins
+                real(module)
+
+            spec.loader.exec_module = exec_module  # type: ignore[method-assign]
+        return spec
+
+    def _import(
+        self, name: str, importer: Any = None, locals_: Any = None, wanted: Sequence[str] = (), level: int = 0
+    ) -> Any:
+        top = name.partition(".")[0]
+        if not level and top in self._absent:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+        if not level and name in self._found:
+            return self._found[name]
+        return builtins.__import__(name, importer, locals_, wanted, level)
+
+
+if PRETEND:
+    if PRETEND not in _MISSING:
+        sys.exit(f"SKYLOOP_PRETEND is {PRETEND!r} and must be one of {', '.join(_MISSING)}")
+    sys.meta_path.insert(0, _Finder(PRETEND))
