@@ -745,7 +745,7 @@ def test_override_needs_its_switch_and_a_receiver() -> None:
     told = " ".join(bench.texts("setup"))
     assert "no switch hands over the sticks" in told
     assert "not a pilot's" in told
-    assert "holds the last sticks for ever" in told
+    assert "holds the last sticks indefinitely" in told
     with pytest.raises(DriverError, match="no switch hands"):
         bench.fly(climb=0.5)
     assert options(OVERRIDE).override

@@ -205,7 +205,7 @@ class Setup:
     def _failsafe(self, override: bool) -> list[Diagnostic]:
         if override:
             detail = (
-                "while the pilot's switch overrides, Betaflight holds the last sticks for ever if MSP falls silent: "
+                "while the pilot's switch overrides, Betaflight holds the last sticks indefinitely if MSP falls silent: "
                 "only the pilot's switch ends that"
             )
             fine = self.identity.variant == INAV
