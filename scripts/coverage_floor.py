@@ -2,8 +2,8 @@
 
     coverage json -o coverage.json && python scripts/coverage_floor.py coverage.json
 
-CI (``.ci/run``), which measures only while it runs the tests of these rooms, and ``make coverage`` run it after the
-tests. It exits with 1 and names anything below its floor.
+CI (``.ci/run``), which traces only what tests the core, and ``make coverage`` run it after the tests. It exits with 1
+and names anything below its floor.
 """
 
 from __future__ import annotations
