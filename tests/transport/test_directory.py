@@ -12,7 +12,7 @@ import pytest
 
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.transport import local
-from skyloop.transport.local import LocalServer, dial, list_names
+from skyloop.transport.local import LocalServer, dial, list_names, names_of_others
 from skyloop.transport.local.directory import directory_owner, find_directory, of_others
 from skyloop.transport.local.sockets import Socket, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
@@ -227,3 +227,13 @@ def test_proxies_of_other_users_are_known_by_name_but_unreachable() -> None:
     owners = {Path(f"/run/user/{number}/skyloop"): number for number in (own, own + 1)}
     assert of_others(table, owners.get) == {user_name(own + 1): ["alpha", "beta"]}
     assert directory_owner(Path("/proc/self/no/such")) == Path("/proc/self").stat().st_uid
+
+
+def test_a_proxy_of_this_user_belongs_to_no_other(runtime_dir: Path) -> None:
+    server = LocalServer("mine")
+    server.start(ServerLog())
+    try:
+        assert [proxy.name for proxy in list_names()] == ["mine"]
+        assert user_name(os.geteuid()) not in names_of_others()
+    finally:
+        server.stop()
