@@ -1,8 +1,9 @@
-"""Check the tests' coverage against its floors: the whole package, and each module of the core.
+"""Check the tests' coverage of each module of the core against its floor.
 
     coverage json -o coverage.json && python scripts/coverage_floor.py coverage.json
 
-CI (``.ci/run``) and ``make coverage`` run it after the tests. It exits with 1 and names anything below its floor.
+CI (``.ci/run``), which traces only what tests the core, and ``make coverage`` run it after the tests. It exits with 1
+and names anything below its floor.
 """
 
 from __future__ import annotations
@@ -13,8 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-TOTAL_PERCENT = 93.0  #: of all lines and branches of the package
-MODULE_PERCENT = 90.0  #: of each module of the core
+MODULE_PERCENT = 90.0  #: of the lines and branches of each module of the core
 CORE = ("client", "drivers", "messages", "network", "proxy", "transport", "vehicles")
 NO_CORE = {"emulation", "emulator", "firmware", "wire"}  #: folders and modules of vehicles that are not drivers
 
@@ -33,9 +33,6 @@ def failures(report: Mapping[str, Any], exceptions: Mapping[str, str] = EXCEPTIO
         exceptions: Modules of the core that may be below the floor, by their path under ``skyloop/``.
     """
     found: list[str] = []
-    total = report["totals"]["percent_covered"]
-    if total < TOTAL_PERCENT:
-        found.append(f"coverage of the package is {total:.1f} %, and must be at least {TOTAL_PERCENT:g} %")
     for path, module in sorted(report["files"].items()):
         name = path.partition("skyloop/")[2]
         percent = module["summary"]["percent_covered"]

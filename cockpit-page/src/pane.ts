@@ -339,13 +339,18 @@ export class Pane {
   private linked(open: boolean, code: number): void {
     this.connected = open;
     this.wasConnected ||= open;
-    if (open) this.events.restart();
-    this.absent = code === 4404 ? (this.isRecording ? t.pane.replayEnded : t.pane.gone(this.name)) : "";
-    this.bar?.end(this.absent !== "");
-    const ended = this.isRecording && this.absent !== "";
+    if (open) this.events.restart(); // the drone may still be absent: the cockpit says so after it has accepted
+    else this.miss(code === 4404 ? (this.isRecording ? t.pane.replayEnded : t.pane.gone(this.name)) : "");
+    this.update();
+  }
+
+  /** Say why the drone is absent; "" if it is not known to be. */
+  private miss(why: string): void {
+    this.absent = why;
+    this.bar?.end(why !== "");
+    const ended = this.isRecording && why !== "";
     setHidden(this.ended, !ended);
     if (ended) for (const part of [this.endReplay, this.fresh.element]) setHidden(part, true);
-    this.update();
   }
 
   private onMessage(message: Vehicle | State): void {
@@ -361,7 +366,7 @@ export class Pane {
       if (message.uri.startsWith("replay:")) this.openBar();
     } else {
       this.state = message;
-      this.absent = "";
+      if (this.absent) this.miss("");
       this.fresh.received(message, this.isRecording);
       this.alarmBook.update(this.found(), performance.now()); // even if the page is hidden and nothing is drawn
       this.remember(message);

@@ -78,11 +78,9 @@ export class LastingSocket {
   private open(): void {
     const wire = this.around.connect(typeof this.path === "string" ? this.path : this.path());
     wire.binaryType = "arraybuffer";
-    wire.onopen = () => {
-      this.pause = FIRST_PAUSE_MS;
-      this.handlers.state?.(true, 0, "");
-    };
+    wire.onopen = () => this.handlers.state?.(true, 0, "");
     wire.onmessage = (event) => {
+      this.pause = FIRST_PAUSE_MS; // not before: what is absent is accepted, and closed at once
       if (!this.closed) this.handlers.message(event.data);
     };
     wire.onclose = (event) => {

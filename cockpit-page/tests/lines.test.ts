@@ -108,7 +108,7 @@ function lasting(path: string | (() => string) = "/ws"): { socket: LastingSocket
   return { socket, wires, paths, pauses, later: () => act(), states, received };
 }
 
-test("a socket comes back, with longer and longer pauses, and short ones again after it was open", () => {
+test("a socket comes back, with longer and longer pauses, and short ones again after it was told something", () => {
   const { wires, pauses, later, states } = lasting();
   for (let number = 0; number < 12; number += 1) {
     wires.at(-1)?.end();
@@ -117,6 +117,11 @@ test("a socket comes back, with longer and longer pauses, and short ones again a
   assert.equal(pauses[0], FIRST_PAUSE_MS);
   assert.equal(pauses.at(-1), LONGEST_PAUSE_MS);
   wires.at(-1)?.open();
+  wires.at(-1)?.end(4404);
+  assert.equal(pauses.at(-1), LONGEST_PAUSE_MS, "accepted and closed: what is absent is not asked for in a hurry");
+  later();
+  wires.at(-1)?.open();
+  wires.at(-1)?.onmessage?.({ data: "{}" });
   wires.at(-1)?.end();
   assert.equal(pauses.at(-1), FIRST_PAUSE_MS);
   assert.deepEqual(states.slice(-2), [true, false]);

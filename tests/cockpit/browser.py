@@ -115,12 +115,14 @@ class DronePage:
         for key in keys:
             self.page.keyboard.press(key)
 
-    def until(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
-        """Wait while the browser continues, never longer than this."""
+    def until(
+        self, condition: Callable[[], bool], what: str | Callable[[], str], timeout_s: float = PATIENCE_S
+    ) -> None:
+        """Wait while the browser continues, never longer than this. ``what`` may be asked for when the time is over."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             assert time.monotonic() < deadline, (
-                f"not within {timeout_s} s: {what}; the page's problems: {self.problems}"
+                f"not within {timeout_s} s: {what() if callable(what) else what}; the page's problems: {self.problems}"
             )
             self.page.wait_for_timeout(20)
 
@@ -129,7 +131,22 @@ class DronePage:
         return self.pane.locator(selector).first.text_content() or ""
 
     def wait_for_text(self, selector: str, text: str) -> None:
-        self.until(lambda: text in self.says(selector), f"{selector} says {text!r}, not {self.says(selector)!r}")
+        self.until(lambda: text in self.says(selector), lambda: f"{selector} says {text!r}: {self.says(selector)!r}")
+
+    def begin_to_mark(self, press: Callable[[], object]) -> None:
+        """Press until a box can be drawn: the cockpit is not asked while it answers late, and the picture is back."""
+        layer, pressed_s = self.pane.locator(".follow-layer").first, 0.0
+
+        def ready() -> bool:
+            nonlocal pressed_s
+            if not layer.is_visible():
+                if time.monotonic() - pressed_s > 3.0:
+                    pressed_s = time.monotonic()
+                    press()
+                return False
+            return "Drag a box" in self.says(".follow-hint")
+
+        self.until(ready, lambda: f"a box can be drawn; the hint is {self.says('.follow-hint')!r}")
 
     @contextmanager
     def holding(self, *keys: str) -> Iterator[None]:

@@ -98,6 +98,14 @@ def test_fingers_arrive(deck: Deck) -> None:
     assert page.problems == []
 
 
+COUNTS_BLINKS = """
+(part) => {
+  window.blinks = 0;
+  new MutationObserver(() => { window.blinks += part.hidden ? 1 : 0; }).observe(part, { attributes: true });
+}
+"""
+
+
 def test_a_finger_scrubs_a_replay_whose_end_is_announced(deck: Deck, tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.mcap", Plan(seconds=4.0))
     deck.address = deck.cockpit("--recordings", str(tmp_path))
@@ -126,6 +134,10 @@ def test_a_finger_scrubs_a_replay_whose_end_is_announced(deck: Deck, tmp_path: P
         f"{deck.address}api/replays/{name}/stop", data={}, headers={"Origin": deck.address.rstrip("/")}
     )
     assert stopped.ok, stopped.text()
-    page.wait_for_text(".ended-replay", "This replay has ended.")
-    page.pane.locator(".ended-replay").get_by_role("button", name="Close").click()
+    ended = page.pane.locator(".ended-replay", has_text="This replay has ended.")
+    ended.wait_for()
+    ended.evaluate(COUNTS_BLINKS)
+    page.page.wait_for_timeout(1500)  # meanwhile the page asks for the drone again and again
+    assert page.page.evaluate("window.blinks") == 0
+    ended.get_by_role("button", name="Close").click()
     page.until(lambda: page.pane.count() == 0, "the overview is left")

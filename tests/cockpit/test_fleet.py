@@ -103,6 +103,27 @@ def test_an_unresponsive_proxy_is_reported_and_retried() -> None:
     run(work)
 
 
+def test_one_that_is_ending_is_not_joined_again_before_it_is_gone() -> None:
+    """The proxy of a replay that was ended is found for another second."""
+    hangar = Hangar("alpha")
+
+    async def work() -> None:
+        fleet = Fleet(hangar, hangar.connect)
+        await settle(fleet)
+        fleet.let_go("alpha", ending=True)
+        for _ in range(2):
+            await settle(fleet)
+            assert not fleet.stations
+        hangar.found.clear()
+        await settle(fleet)
+        hangar.found.append("alpha")
+        await settle(fleet)
+        assert list(fleet.stations) == ["alpha"], "another one of that name"
+        await fleet.close()
+
+    run(work)
+
+
 def test_one_that_was_never_there_leaves_no_trace() -> None:
     hangar = Hangar("alpha")
     hangar.fails.add("alpha")

@@ -166,8 +166,7 @@ def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, 
     camera.get_by_role("button", name="full screen").click()
     page.until(lambda: camera.evaluate("camera => document.fullscreenElement === camera"), "it is full")
     camera.get_by_role("button", name="Motors off").wait_for()  # within reach there, too
-    camera.get_by_role("button", name="Follow something").click()
-    page.wait_for_text(".follow-hint", "Drag a box")
+    page.begin_to_mark(camera.get_by_role("button", name="Follow something").click)
     camera.get_by_role("button", name="Motors off").click(trial=True)  # also above the layer for drawing a box
     camera.get_by_role("button", name="Follow something").click()
     page.page.evaluate("document.exitFullscreen()")

@@ -114,8 +114,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
         page.wait_for_new_picture()
         sight, mouse = Sight(page, walker, drone), page.page.mouse
         began_m = place_x(drone)
-        page.press("f")
-        page.wait_for_text(".follow-hint", "Drag a box")
+        page.begin_to_mark(lambda: page.press("f"))
 
         def press(x: float, y: float) -> None:
             mouse.move(x, y)
@@ -149,8 +148,7 @@ def test_a_person_is_marked_with_the_mouse_and_followed(deck: Deck, tmp_path: Pa
 
         # A processor's detection is chosen by a click, without dragging.
         drone.on_frame(lambda frame: detected(walker, drone, frame))
-        page.press("f")
-        page.wait_for_text(".follow-hint", "Drag a box")
+        page.begin_to_mark(lambda: page.press("f"))
 
         def hover_over_it() -> bool:
             left, top, right, bottom = sight.on_screen()
@@ -186,8 +184,7 @@ def test_a_person_is_marked_with_a_finger_and_followed(deck: Deck, tmp_path: Pat
         tap_control(page)
         tap_until(page, "Take off", "hovering")
         began_m = place_x(drone)
-        page.pane.get_by_role("button", name="Follow something in camera front").tap()
-        page.wait_for_text(".follow-hint", "Drag a box")
+        page.begin_to_mark(page.pane.get_by_role("button", name="Follow something in camera front").tap)
         picture(page, "follow-phone-hint")
         with fingers.on(page.page) as hand:
 

@@ -111,10 +111,10 @@ def cast(quads: Quads, pose: CameraPose, rays: NDArray[np.float64]) -> tuple[NDA
         if not quads.two_sided[k]:
             toward = np.where(toward < 0.0, toward, np.nan)
         z = ((corners[0] - pose.position_m) @ normal) / toward
-        points = pose.position_m + z[:, None] * world
-        inside = (z > 0.0) & (z < nearest)
+        inside = np.flatnonzero((z > 0.0) & (z < nearest))
         for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-            inside &= (points - a) @ np.cross(normal, b - a) >= -1e-9
+            points = pose.position_m + z[inside, None] * world[inside]
+            inside = inside[(points - a) @ np.cross(normal, b - a) >= -1e-9]
         nearest[inside], hit[inside] = z[inside], k
     return hit, nearest
 

@@ -286,3 +286,13 @@ def test_proxies_of_other_users_are_known_by_name_but_unreachable() -> None:
     assert of_others(table, owners.get) == {user_name(own + 1): ["alpha", "beta"]}
     assert isinstance(names_of_others(), dict)
     assert directory_owner(Path("/proc/self/no/such")) == Path("/proc/self").stat().st_uid
+
+
+def test_a_proxy_of_this_user_belongs_to_no_other(runtime_dir: Path) -> None:
+    server = LocalServer("mine")
+    server.start(ServerLog())
+    try:
+        assert [proxy.name for proxy in list_names()] == ["mine"]
+        assert user_name(os.geteuid()) not in names_of_others()
+    finally:
+        server.stop()

@@ -77,6 +77,7 @@ class Fleet:
         self._search_s = search_s
         self._seen_ns: dict[str, int] = {}
         self._found: dict[str, Found] = {}  # the proxies found by the last search
+        self._over: set[str] = set()  # proxies that are ending, until they are no longer found
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
@@ -109,13 +110,15 @@ class Fleet:
         """Search once: start connecting to new proxies, and remove drones that have been lost for a long time."""
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
+        self._over &= found.keys()
+        for name in self._over:
+            del found[name]
         for name, one in found.items():
             self._seen_ns[name] = now_ns
             self._found[name] = one
-            if name in self.stations:
-                station = self.stations[name]
+            if station := self.stations.get(name):
                 station.found = station.found._replace(transport=one.transport)
-            if name not in self.stations and name not in self._connecting:
+            elif name not in self._connecting:
                 self._connecting[name] = asyncio.create_task(self._join(one))
         for name in [name for name in self.problems if name not in found]:
             del self.problems[name]
@@ -137,8 +140,10 @@ class Fleet:
         waiting = dict.fromkeys(self._connecting, "the cockpit is still connecting to it")
         return {**waiting, **self.problems}
 
-    def let_go(self, name: str) -> None:
-        """Remove a drone; the drone reappears if it is found again. If the name is unknown, do nothing."""
+    def let_go(self, name: str, *, ending: bool = False) -> None:
+        """Remove a drone; it reappears if it is found again, or if its proxy is ``ending``, after that was gone."""
+        if ending:
+            self._over.add(name)
         if name in self.stations:
             start_task(self.stations.pop(name).close(), self._closing)
 

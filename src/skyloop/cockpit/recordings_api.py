@@ -210,7 +210,7 @@ class RecordingsApi:
         check_json(request)
         name = request.path_params["name"]
         await self._recordings.end_replay(name)
-        self._fleet.let_go(name)
+        self._fleet.let_go(name, ending=True)
         return answer_json({"drone": name})
 
     async def _annotate(self, request: Request, write: Callable[[Path], Notes], status: int = 200) -> Response:

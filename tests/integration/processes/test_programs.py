@@ -15,9 +15,10 @@ pytestmark = pytest.mark.process
 
 SIM = "sim://?world=empty&cameras=none&speed=3&wind=0"
 BEGINS = """
-import atexit, sys, threading, time
+import atexit, signal, sys, threading, time
 import skyloop
 
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # where the tests run under nohup, it would be ignored
 drone = skyloop.connect(sys.argv[1], name="program")
 drone.takeoff()
 

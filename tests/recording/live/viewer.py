@@ -9,7 +9,7 @@ import itertools
 import json
 import struct
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any, Self
 
@@ -73,8 +73,9 @@ class Viewer:
         self._send(op="getParameters", parameterNames=list(names), id="get")
         return self._answer("get")
 
-    def follow_parameters(self, names: Iterable[str]) -> None:
+    def follow_parameters(self, names: Sequence[str]) -> None:
         self._send(op="subscribeParameterUpdates", parameterNames=list(names))
+        self.get_parameters(names)  # answered after the line above was heard: what changes from now on is sent
 
     def set_parameter(self, name: str, value: object) -> list[dict[str, Any]]:
         self._send(op="setParameters", parameters=[{"name": name, "value": value}], id="set")

@@ -205,8 +205,8 @@ class Setup:
     def _failsafe(self, override: bool) -> list[Diagnostic]:
         if override:
             detail = (
-                "while the pilot's switch overrides, Betaflight holds the last sticks indefinitely if MSP falls silent: "
-                "only the pilot's switch ends that"
+                "while the pilot's switch overrides, Betaflight holds the last sticks indefinitely if MSP falls "
+                "silent: only the pilot's switch ends that"
             )
             fine = self.identity.variant == INAV
             return [] if fine else [Diagnostic("silence", False, detail, "keep a thumb on the switch")]
