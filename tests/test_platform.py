@@ -78,9 +78,9 @@ def test_the_tail_of_a_file_leaves_its_writers_position_alone(
 
 
 def test_output_of_a_child_is_waited_for() -> None:
-    child = ChildProcess([sys.executable, "-c", "print('a', flush=True); input()"])
+    child = ChildProcess([sys.executable, "-c", "import os; os.write(1, b'ready'); input()"])
     try:
-        assert platform.read_within(child.stdout, 30.0) == b"a\n"
+        assert platform.read_within(child.stdout, 30.0) == b"ready"
         assert platform.read_within(child.stdout, 0.0) is None
         child.part()
         assert platform.read_within(child.stdout, 30.0) == b""
@@ -116,14 +116,14 @@ def test_priorities(windows: Callable[..., None], monkeypatch: pytest.MonkeyPatc
     platform.lower_priority(10, thread_only=True)  # would slow the whole process
     platform.lower_priority(5)
     windows(
-        GetCurrentThread=lambda: "thread",
-        GetCurrentProcess=lambda: "process",
-        SetThreadPriority=lambda *given: done.append(given),
-        SetPriorityClass=lambda *given: done.append(given),
+        GetCurrentThread=lambda: -2,
+        GetCurrentProcess=lambda: -1,
+        SetThreadPriority=lambda thread, priority: done.append((thread.value, priority)),
+        SetPriorityClass=lambda process, kind: done.append((process.value, kind)),
     )
     platform.lower_priority(10, thread_only=True)
     platform.lower_priority(10)
-    assert done == [("nice", 10), ("nice", 5), ("thread", -2), ("process", 0x4000)]
+    assert done == [("nice", 10), ("nice", 5), (2**64 - 2, -2), (2**64 - 1, 0x4000)]
 
 
 @pytest.mark.parametrize("system", ["here", "windows"])
@@ -181,8 +181,33 @@ def test_modes_of_files_say_nothing_on_windows(windows: Callable[..., None]) -> 
 
 
 def test_keys_of_a_windows_console(windows: Callable[..., None]) -> None:
-    typed = ["w", "\xe0", "H", "\x1b", "\0", ";"]  # w, up, Esc, F1
-    windows({"kbhit": lambda: bool(typed), "getwch": lambda: typed.pop(0)})
+    w, grave, shift, up, escape = (0x57, "w"), (0x30, "à"), (0x10, "\0"), (0x26, "\0"), (0x1B, "\x1b")
+    typed = [(1, True, *w), (1, False, *w), (1, True, *shift), (1, True, *up), (16, True, 0, "\0")]
+    typed += [(1, True, *grave), (1, True, *escape), (1, True, 0, "\ud83d")]
+
+    def read(console: Any, records: Any, most: int, count: Any) -> int:
+        assert console.value == 3
+        count._obj.value = min(most, len(typed))
+        for record in records[: count._obj.value]:
+            record.kind, record.down, record.key, character = typed.pop(0)
+            record.character = ord(character)
+        return 1
+
+    waits: list[int] = []
+
+    def wait(_console: Any, wait_ms: int) -> int:
+        waits.append(wait_ms)
+        return 0 if typed else 0x102
+
+    windows(GetStdHandle=lambda number: 3 if number == -10 else None, WaitForSingleObject=wait, ReadConsoleInputW=read)
     with platform.single_keys(0) as keys:
-        assert keys(1.0) == b"w\x1b[A\x1b\x1b[99~"
-        assert keys(0.0) is None
+        assert keys(1.0) == b"w\x1b[A" + "à".encode() + b"\x1b?"
+        assert keys(0.5) is None
+        assert waits == [1000, 500]
+        typed += [(1, False, *w)]
+        assert keys(0.0) is None, "a released key is none"
+
+
+def test_an_input_record_has_the_layout_of_windows() -> None:
+    assert ctypes.sizeof(platform._input_record()) == 20
+    assert platform._input_record().character.offset == 14

@@ -30,9 +30,10 @@ _BELOW_NORMAL_PRIORITY_CLASS: Final = 0x00004000
 _THREAD_PRIORITY_LOWEST: Final = -2
 _POLL_S: Final = 0.005  # how often to ask where the system can't wait
 _CHUNK: Final = 4096
-#: What POSIX terminals send for the keys that ``msvcrt.getwch`` reports with a prefix and a scan code: arrows.
-_WINDOWS_KEYS: Final = {"H": b"\x1b[A", "P": b"\x1b[B", "M": b"\x1b[C", "K": b"\x1b[D"}
-_NO_FUNCTION: Final = b"\x1b[99~"  # a key without a function here
+_STD_INPUT_HANDLE: Final = -10
+_KEY_EVENT: Final = 1
+#: What POSIX terminals send for the arrows, by virtual-key code (learn.microsoft.com/windows/win32/inputdev).
+_ARROWS: Final = {0x26: b"\x1b[A", 0x28: b"\x1b[B", 0x27: b"\x1b[C", 0x25: b"\x1b[D"}
 
 
 # Processes ------------------------------------------------------------------------------------------------------
@@ -124,10 +125,12 @@ def lower_priority(niceness: int, *, thread_only: bool = False) -> None:
     import ctypes
 
     kernel32 = ctypes.WinDLL("kernel32")
+    this = kernel32.GetCurrentThread if thread_only else kernel32.GetCurrentProcess
+    this.restype = ctypes.c_void_p  # a handle, which does not fit into an int
     if thread_only:
-        kernel32.SetThreadPriority(kernel32.GetCurrentThread(), _THREAD_PRIORITY_LOWEST)
+        kernel32.SetThreadPriority(ctypes.c_void_p(this()), _THREAD_PRIORITY_LOWEST)
     else:
-        kernel32.SetPriorityClass(kernel32.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
+        kernel32.SetPriorityClass(ctypes.c_void_p(this()), _BELOW_NORMAL_PRIORITY_CLASS)
 
 
 def on_signals(numbers: Sequence[int], call: Callable[[], object]) -> None:
@@ -141,8 +144,13 @@ def on_signals(numbers: Sequence[int], call: Callable[[], object]) -> None:
         for number in numbers:
             loop.add_signal_handler(number, call)
         return
+
+    def handle(*_: object) -> None:
+        with suppress(RuntimeError):  # the loop has ended, and the process is about to
+            loop.call_soon_threadsafe(call)
+
     for number in (*numbers, getattr(signal, "SIGBREAK", signal.SIGINT)):
-        signal.signal(number, lambda *_: loop.call_soon_threadsafe(call))
+        signal.signal(number, handle)
 
 
 def sees_peers() -> bool:
@@ -247,22 +255,47 @@ def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
 
 
 def _console_keys(within_s: float) -> bytes | None:
-    """Wait for keys in a console of Windows.
+    """Wait for keys in a console of Windows, by its input records.
 
-    ``msvcrt`` does not report Ctrl-C, which interrupts the program as usual. Arrow and function keys come as two
-    characters, of which the first is NUL or U+00E0 (docs.python.org/3/library/msvcrt.html); only arrows mean something.
+    They are described at learn.microsoft.com/windows/console/readconsoleinput. ``msvcrt.getwch`` would not do: it announces an arrow by the character ``à``, which French keyboards have as a key,
+    and then waits for another one. Ctrl-C interrupts the program as usual, and is no record.
     """
+    import ctypes
+
     if sys.platform != "win32":
         raise NotImplementedError
-    import msvcrt
-
-    deadline_s = time.monotonic() + within_s
-    while not msvcrt.kbhit():
-        if time.monotonic() >= deadline_s:
+    kernel32 = ctypes.WinDLL("kernel32")
+    kernel32.GetStdHandle.restype = ctypes.c_void_p
+    console, count = ctypes.c_void_p(kernel32.GetStdHandle(_STD_INPUT_HANDLE)), ctypes.c_ulong()
+    deadline_s, keys = time.monotonic() + within_s, b""
+    while not keys:  # records of other kinds wake this, too: of the mouse, of keys that are released
+        left_ms = max(0, math.ceil((deadline_s - time.monotonic()) * 1e3))
+        if kernel32.WaitForSingleObject(console, left_ms) != 0:
             return None
-        time.sleep(_POLL_S)
-    keys = b""
-    while msvcrt.kbhit():
-        key = msvcrt.getwch()
-        keys += _WINDOWS_KEYS.get(msvcrt.getwch(), _NO_FUNCTION) if key in "\0\xe0" else key.encode()
+        records = (_input_record() * 64)()
+        kernel32.ReadConsoleInputW(console, records, len(records), ctypes.byref(count))
+        for record in records[: count.value]:
+            if record.kind == _KEY_EVENT and record.down:
+                arrow = _ARROWS.get(record.key)
+                keys += arrow or chr(record.character).encode(errors="replace").strip(b"\0")
+        if not left_ms and not keys:
+            return None
     return keys
+
+
+def _input_record() -> Any:
+    """Return the layout of a console's input record (learn.microsoft.com/windows/console/input-record-str)."""
+    import ctypes
+
+    class Record(ctypes.Structure):
+        _fields_ = (
+            ("kind", ctypes.c_uint16),
+            ("down", ctypes.c_int32),
+            ("repeats", ctypes.c_uint16),
+            ("key", ctypes.c_uint16),
+            ("scan", ctypes.c_uint16),
+            ("character", ctypes.c_uint16),
+            ("modifiers", ctypes.c_uint32),
+        )
+
+    return Record

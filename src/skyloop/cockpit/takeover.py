@@ -179,7 +179,7 @@ GIVEN_S: Final = 2.0  #: a handover takes effect within this time; any later los
 class AuthorityReport:
     """Compares the current authority with the last message sent to the page. Used on the event loop.
 
-    ``gone_s``: the page's control expires once the cockpit has received nothing from the page for this long [s].
+    ``gone_s``: the page's control expires once the page has received nothing from the cockpit for this long [s].
     """
 
     def __init__(self, station: Station, app: str, gone_s: float) -> None:

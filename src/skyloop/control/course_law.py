@@ -168,7 +168,7 @@ class CourseLaw(VelocityLaw):
         if self._filter.newest is None:
             expected = math.hypot(self.settings.map_m, self._shift_m, 0.05)
             self._filter.start(self._nominal(self.number), expected, captured_ns)
-        if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):  # as in FollowLaw.see
+        if not self._filter.update(middle, 0.03 + 0.008 * distance**2, captured_ns):  # grows as in FollowLaw.see
             return
         weight = 0.15 * trust / max(1.0, 0.4 * distance)
         mixed = (1.0 - weight) * self._heading + weight * across

@@ -123,7 +123,7 @@ class GateLaw(VelocityLaw):
             return
         motion, to_level = found
         distance = float(np.linalg.norm(position))
-        deviation = 0.02 + 0.006 * distance**2  # as in FollowLaw.see
+        deviation = 0.02 + 0.006 * distance**2  # grows as in FollowLaw.see
         if not self._gate.update(motion.position + to_level @ position, deviation, captured_ns):
             return
         way = -(to_level @ normal)[:2]
