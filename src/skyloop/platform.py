@@ -257,8 +257,9 @@ def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
 def _console_keys(within_s: float) -> bytes | None:
     """Wait for keys in a console of Windows, by its input records.
 
-    They are described at learn.microsoft.com/windows/console/readconsoleinput. ``msvcrt.getwch`` would not do: it announces an arrow by the character ``à``, which French keyboards have as a key,
-    and then waits for another one. Ctrl-C interrupts the program as usual, and is no record.
+    learn.microsoft.com/windows/console/readconsoleinput describes them. ``msvcrt.getwch`` would not do: it announces an
+    arrow by the character ``à``, which French keyboards have as a key, and then waits for another one. Ctrl-C
+    interrupts the program as usual, and is no record.
     """
     import ctypes
 
