@@ -1,4 +1,4 @@
-"""``skyloop ros``: presents drones as nodes of ROS 2."""
+"""``skyloop ros``: exposes drones as ROS 2 nodes."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _PLAIN: Final = {
 }
 _RED: Final = 31  # colour codes of ECMA-48 ("ANSI")
 _YELLOW: Final = 33
-#: Colours of output lines, by the words at their beginning.
+#: Colours of output lines, keyed by their first words.
 _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RED, "note: ": _YELLOW}
 
 

@@ -246,7 +246,7 @@ class ConnectionSupervisor:
     ) -> None:
         """Prepare to connect; :meth:`start` makes the connection.
 
-        ``begin`` arranges calls of :meth:`attend` from the first session on; if None, a separate thread calls it.
+        ``begin`` schedules calls to :meth:`attend`, starting with the first session; None: a separate thread does.
         """
         self.connection = connection
         self._handler = handler

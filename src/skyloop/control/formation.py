@@ -206,7 +206,7 @@ def kept_apart(
         velocities: Velocities in world axes, (n, 3) [m/s].
         positions: Positions in world axes, (n, 3) [m].
         apart_m: The minimum allowed distance.
-        gain: Rate of separation per metre of missing distance [1/s].
+        gain: Speed of separation per metre by which drones are too close [1/s].
         fixed: Number of drones at the end of the list that are not steered here and therefore don't yield.
 
     Returns:

@@ -144,7 +144,7 @@ class TargetFollower(AirframeLaw):
     def look(self, frame: Frame) -> list[Shape]:
         """Find the target in the next frame and return the shapes to draw: its box, its track and the phase.
 
-        Raises UsageError if the first box does not fit into the image or the camera's intrinsics are unknown.
+        Raises UsageError if the first box lies outside the image or the camera's intrinsics are unknown.
         """
         state, newest = frame.feedback, self.airframe.feedback
         if newest is not None and not_ahead(frame.captured_ns, newest.captured_ns) is None:

@@ -20,7 +20,7 @@ from skyloop.drivers.vehicle_link import PAUSE_S
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
-#: Number of failed ticks in a row (half a second) after which a proxy counts as failed: it no longer has a failsafe.
+#: Number of failed ticks in a row (half a second) after which a proxy has failed: its failsafe no longer runs.
 MAX_FAILURES: Final = 25
 WHOLE_ROUNDS: Final = 5  #: a proxy does what is not urgent only every this many rounds, ten times a second
 _log = logging.getLogger(__name__)

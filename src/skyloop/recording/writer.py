@@ -131,7 +131,7 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Size in bytes, including waiting data."""
+        """Size in bytes, including data that is not written yet."""
         return self._output.tell()
 
     @property

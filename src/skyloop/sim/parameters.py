@@ -169,7 +169,7 @@ class VehicleParameters:
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
     # When the roll and pitch set-points are close to level, the firmware may tilt to oppose the motion. This value is
-    # the deceleration per speed at a level set-point; it decreases in proportion to the tilt and is zero at full tilt.
+    # the deceleration per unit of speed at a level set-point; it falls linearly with the tilt and is zero at full tilt.
     level_brake_per_s: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above

@@ -3,7 +3,7 @@
 Detections are joined into objects with permanent numbers as in Zhang et al., "ByteTrack: Multi-Object Tracking by
 Associating Every Detection Box", ECCV 2022: confident detections are matched with all objects first, then uncertain
 ones with the remaining objects, because half-hidden things get low scores. Only confident detections start new objects.
-Each object's box has a constant-velocity Kalman filter, which uses real times here instead of image counts, so that a
+Each object's box has a constant-velocity Kalman filter, which uses timestamps instead of counting images, so that a
 missed frame does no harm. The pairs come from SciPy's ``linear_sum_assignment``.
 """
 

@@ -39,7 +39,7 @@ class Raster:
 
     @staticmethod
     def of(model: CameraModel, samples: int) -> Raster:
-        """Compute one or four samples per pixel; with distortion, this takes 0.2 s once for 960×720 pixels."""
+        """Compute one or four samples per pixel; with distortion, the first call for 960×720 pixels takes 0.2 s."""
         return _raster(model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
 
 

@@ -130,7 +130,7 @@ class DepthBuffer:
         self._number = np.empty(working, np.int32)
         self._mask = np.empty(working, np.uint8)
         self._scratch = np.empty(working, np.bool_)
-        #: Index (in the view) plus one of the quad at each sample, 0 for no quad; int32, shape (height, width).
+        #: One-based index, in the view, of the quad at each sample; 0 for no quad; int32, shape (height, width).
         #: Overwritten by the next call of :meth:`draw`.
         self.seen = np.empty(shape, np.int32)
 

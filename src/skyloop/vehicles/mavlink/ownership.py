@@ -117,7 +117,7 @@ class FlightOwnership:
         return self._by_itself
 
     def on_link_lost(self) -> None:
-        """When the vehicle is found again, treat its mode as foreign unless it was chosen here."""
+        """When the vehicle is found again, treat its mode as chosen by others unless the proxy chose it."""
         self._from = ""
 
     def on_flight_over(self) -> None:

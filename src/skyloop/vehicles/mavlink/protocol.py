@@ -497,7 +497,7 @@ class MavlinkSession(VehicleSession):
             self._publish_event(event_of(limits_text(self.limits), "limits"))
 
     def _on_version(self, version: Message, now_ns: int) -> None:
-        """Handle the vehicle's version. A rediscovered vehicle counts as the same only if its version proves it."""
+        """Handle the vehicle's version. A rediscovered vehicle is the same one only if its version matches."""
         before, self._known_as, self.version = self._known_as, None, version
         same = True if before is None else _is_same(before, version)
         heartbeat = self.telemetry.newest("HEARTBEAT", now_ns)

@@ -74,7 +74,7 @@ def set_point(
     most_tilt = configuration.number("control:euler_angle_max")
     right, ahead = clamped(progress.roll, 1.0), -clamped(progress.pitch, 1.0)
     if progress.flags & Pcmd.ABSOLUTE and progress.heading is not None:
-        # The command is relative to the remote control's heading: rotate it by the difference to the drone's heading.
+        # The command is relative to the remote control's heading: rotate it by its offset from the drone's heading.
         right, ahead = turned(right, ahead, (math.pi / 2 - yaw_rad) - progress.heading * math.pi)
     roll, pitch = right * most_tilt, ahead * most_tilt
     yaw_rate = -clamped(progress.yaw, 1.0) * configuration.number("control:control_yaw")

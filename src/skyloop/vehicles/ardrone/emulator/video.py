@@ -60,7 +60,7 @@ FRONT_2: Final = replace(
     cy=190.144373,
     distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0),
 )
-#: Model of the transmitted image, the middle of the sensor's 320×240 image at twice the size.
+#: Model of the transmitted image: the centre of the sensor's 320×240 image, enlarged to twice the size.
 BOTTOM_2_SENT: Final = replace(
     BOTTOM_CAMERA, width=640, height=360, fx=686.994766, fy=688.195055, cx=329.323208, cy=159.323007
 )
