@@ -323,7 +323,7 @@ class Pieces(socket.socket):
         super().__init__()
         self._pieces, self._arrived = pieces, b""
 
-    def recv(self, size: int, flags: int = 0) -> bytes:  # type: ignore[override]
+    def recv(self, size: int, flags: int = 0) -> bytes:
         if not self._arrived:
             if not self._pieces:
                 return b""
@@ -386,12 +386,15 @@ def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> No
     assert time.monotonic() - began < 2.0
     assert 1 <= sent <= 8, "the backlog is bounded"
     assert here._rest, "the last one was sent in part"
+    room = threading.Event()
+    here.on_room(room.set)
     with pytest.raises(BlockingIOError):
         here.post(b"another")
     assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
     with pytest.raises(BlockingIOError):
         there.recv(MAX_PACKET, 1)
-    wait_until(lambda: not here._rest, "it is complete")
+    assert room.wait(5.0)
+    assert not here._rest
     here.send(b"another")
     assert there.recv(100) == b"another"
 

@@ -6,7 +6,7 @@ users of the host, and programs that took over the port of an ended server, lear
 its registration. The lock ends with the process and shows whether it still runs.
 
 Each packet follows its length in four bytes. If the kernel takes only a part of a packet, a thread sends the rest when
-there is room, and further packets are refused until then.
+there is room, and further packets are refused until then. The server is then told, so that it sends the newest frame.
 """
 
 from __future__ import annotations
@@ -114,6 +114,8 @@ class StreamSocket:
         self._sending = threading.RLock()
         self._inside = False  # whether a call that sends is under way
         self._rest = b""  # the unsent end of a packet that was sent in part
+        self._awaiting_room = False  # whether a thread waits until something fits again
+        self._has_room: Callable[[], object] | None = None
         self._partial = bytearray()  # the beginning of an incomplete packet, with its length
         self._ended = False
 
@@ -134,29 +136,46 @@ class StreamSocket:
             self._sending.release()
 
     def _send(self, packet: bytes) -> None:
-        if self._inside or self._rest:
-            raise BlockingIOError(errno.EAGAIN, "an earlier packet is not complete yet")
+        if self._inside:
+            raise BlockingIOError(errno.EAGAIN, "this thread is sending")
         self._inside = True
         try:
+            self._send_rest()
             content = len(packet).to_bytes(_LENGTH, "little") + packet
-            sent = self._socket.send(content)
-            if sent < len(content):
-                self._rest = content[sent:]
-                _thread.start_new_thread(self._complete, ())
-        except RuntimeError as error:  # no more threads
-            self.hang_up()
-            raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
+            self._rest = content[self._socket.send(content) :]
+        except BlockingIOError:
+            self._await_room()
+            raise
+        else:
+            if self._rest:
+                self._await_room()
         finally:
             self._inside = False
 
+    def _send_rest(self) -> None:
+        while self._rest:
+            self._rest = self._rest[self._socket.send(self._rest) :]
+
+    def _await_room(self) -> None:
+        if not self._awaiting_room:
+            self._awaiting_room = True
+            try:
+                _thread.start_new_thread(self._complete, ())
+            except RuntimeError as error:  # no more threads
+                self.hang_up()
+                raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
+
     def _complete(self) -> None:
-        """Send the rest of a packet as soon as there is room."""
+        """Send the rest of a packet as soon as there is room, and tell the server so."""
         with suppress(OSError, ValueError):  # the connection has ended, or was closed
             wait = _waiter(self._socket, to_send=True)
-            while self._rest and not self._ended:
+            while self._awaiting_room and not self._ended:
                 wait(_SLICE_MS)
                 with self._sending, suppress(BlockingIOError):
-                    self._rest = self._rest[self._socket.send(self._rest) :]
+                    self._send_rest()
+                    self._awaiting_room = False
+            if (has_room := self._has_room) is not None:
+                has_room()
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
         raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
@@ -245,6 +264,9 @@ class StreamSocket:
     def limit_wait(self, seconds: float) -> None:
         self._wait_s = seconds
 
+    def on_room(self, call: Callable[[], object]) -> None:
+        self._has_room = call
+
     def limit_backlog(self) -> None:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
 
@@ -253,6 +275,7 @@ class StreamSocket:
             with suppress(OSError):
                 self.send(last_packet)
         self._ended = True
+        self._has_room = None
         with suppress(OSError):  # the connection had already ended
             self._socket.shutdown(socket.SHUT_RDWR)
 

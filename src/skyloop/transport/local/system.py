@@ -85,6 +85,9 @@ class PacketSocket(Protocol):
     def limit_wait(self, seconds: float) -> None:
         """Limit how long receiving waits [s]. 0 means no limit."""
 
+    def on_room(self, call: Callable[[], object]) -> None:
+        """Call a function on any thread when something fits again after a packet did not. Not all sides need this."""
+
     def limit_backlog(self) -> None:
         """Limit the data that waits to be read at the other end."""
 
