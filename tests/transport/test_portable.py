@@ -119,6 +119,7 @@ def test_strangers_are_turned_away_without_a_word(
         assert peer is NOBODY
         assert complaint in reason
         assert log.joined == []
+        monkeypatch.setattr(portable, "HANDSHAKE_S", 5.0)
         client = dial("alpha")(ClientLog())
         wait_until(lambda: log.joined, "others are let in")
         client.close()
@@ -274,12 +275,12 @@ def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> 
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
-    """Two ends, and the raw socket of the first."""
+    """A client's end and its server's, and the raw socket of the first."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        portable._limit_received(listener)
+        portable._limit_received(listener, portable._TO_SERVER)
         raw = socket.create_connection(listener.getsockname())
         there, _ = listener.accept()
-    ends = [StreamSocket(sock, Credentials(1, 1, 1)) for sock in (raw, there)]
+    ends = [StreamSocket(sock, Credentials(1, 1, 1), portable._TO_SERVER) for sock in (raw, there)]
     for end in ends:
         end.limit_backlog()
         end.limit_wait(5.0)
@@ -341,7 +342,7 @@ def test_packets_cut_anywhere_arrive_whole(sent: list[bytes], cuts: list[int]) -
     places = sorted({0, len(content), *(cut for cut in cuts if cut < len(content))})
     pieces = [content[begin:end] for begin, end in itertools.pairwise(places)]
     with socket.socket() as unused, Pieces(pieces) as raw:
-        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end = StreamSocket(unused, Credentials(1, 1, 1), 0)
         end._socket.close()
         end._socket = raw  # type: ignore[assignment]
         received: list[bytes] = []
@@ -354,7 +355,7 @@ def test_packets_cut_anywhere_arrive_whole(sent: list[bytes], cuts: list[int]) -
 @given(st.binary(max_size=200))
 def test_any_bytes_are_packets_or_the_end(content: bytes) -> None:
     with socket.socket() as unused, Pieces([content] if content else []) as raw:
-        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end = StreamSocket(unused, Credentials(1, 1, 1), 0)
         end._socket.close()
         end._socket = raw  # type: ignore[assignment]
         for _ in range(60):

@@ -52,9 +52,10 @@ VERSION: Final = 1  #: of the registration and the handshake
 HANDSHAKE_S: Final = 2.0  #: time for both ends to prove that they know the secret
 MAX_STRANGERS: Final = 32  #: connections that have not done that yet; of more, the oldest is closed
 _HOST: Final = "127.0.0.1"
-#: Size of each end's buffer. On Linux, 290 packets of 66 bytes or 66 of 300 wait for a stalled reader, about as many as
-#: on the fast side. Larger packets are sent in part, and completed while the other end reads.
-_BUFFER: Final = 16_384
+#: Sizes of both ends' buffers towards the server and the client. On Linux, 290 set-points wait for a stalled server and
+#: 200 packets of 300 bytes for a stalled client, as on the fast side. Larger packets are completed while it reads.
+_TO_SERVER: Final = 16_384
+_TO_CLIENT: Final = 32_768
 _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
@@ -103,8 +104,9 @@ class _TcpSocket(socket.socket):
 class StreamSocket:
     """A TCP connection that carries packets; see :class:`skyloop.transport.local.system.PacketSocket`."""
 
-    def __init__(self, sock: socket.socket, who: Credentials) -> None:
+    def __init__(self, sock: socket.socket, who: Credentials, backlog: int) -> None:
         self.who = who
+        self._backlog = backlog
         self._socket = _TcpSocket(fileno=sock.detach())
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -268,7 +270,7 @@ class StreamSocket:
         self._has_room = call
 
     def limit_backlog(self) -> None:
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         if last_packet:
@@ -354,7 +356,7 @@ def listen(path: Path, gid: int | None) -> Gate:
     try:
         if exclusive := getattr(socket, "SO_EXCLUSIVEADDRUSE", 0):  # Windows would let others listen on the same port
             listener.setsockopt(socket.SOL_SOCKET, exclusive, 1)
-        _limit_received(listener)
+        _limit_received(listener, _TO_SERVER)
         listener.bind((_HOST, 0))
         listener.listen(128)
         registration = Registration(listener.getsockname()[1], os.getpid(), os.urandom(32), prefix())
@@ -364,9 +366,9 @@ def listen(path: Path, gid: int | None) -> Gate:
         raise
 
 
-def _limit_received(sock: socket.socket) -> None:
+def _limit_received(sock: socket.socket, size: int) -> None:
     """Limit what waits in the kernel to be read. Must be called before the connection is made."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
 
 
 def _register(path: Path, registration: Registration) -> int:
@@ -443,7 +445,7 @@ def connect(path: Path) -> StreamSocket:
         raise ConnectionRefusedError(errno.ECONNREFUSED, "its process has ended")
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        _limit_received(sock)
+        _limit_received(sock, _TO_CLIENT)
         sock.settimeout(CONNECT_TIMEOUT_S)
         sock.connect((_HOST, registration.port))
         _introduce(sock, registration, time.monotonic() + HANDSHAKE_S)
@@ -453,7 +455,7 @@ def connect(path: Path) -> StreamSocket:
     except BaseException:
         sock.close()
         raise
-    return StreamSocket(sock, Credentials(registration.pid, own_uid(), 0))
+    return StreamSocket(sock, Credentials(registration.pid, own_uid(), 0), _TO_SERVER)
 
 
 def _introduce(sock: socket.socket, registration: Registration, deadline_s: float) -> None:
@@ -472,7 +474,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
     while len(content) < size:
         sock.settimeout(max(1e-3, deadline_s - time.monotonic()))
         if not (more := sock.recv(size - len(content))):
-            raise ConnectionAbortedError(errno.ECONNABORTED, "it ended the connection: the secret is not its own")
+            raise ConnectionAbortedError(errno.ECONNABORTED, "it turned this process away")
         content += more
     return content
 
@@ -574,7 +576,7 @@ class Gate:
         found: StreamSocket | str = ""
         try:
             pid = _challenge(sock, self._registration, time.monotonic() + HANDSHAKE_S)
-            found = StreamSocket(sock, Credentials(pid, own_uid(), 0))
+            found = StreamSocket(sock, Credentials(pid, own_uid(), 0), _TO_CLIENT)
         except StrangerError as error:
             found = f"{_TURNED_AWAY}: {error}"
         except TimeoutError:
