@@ -36,7 +36,7 @@ def announce(raw: PacketSocket, slot: SlotMemory) -> None:
     """Send a slot's announcement, as a server does."""
 
     class Announcing:
-        transmit = staticmethod(raw.post)
+        transmit = staticmethod(raw.send)
         transmit_descriptor = staticmethod(raw.send_descriptor)
 
     slot.announce(Announcing(), 1)

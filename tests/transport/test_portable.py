@@ -27,7 +27,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
 from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
 from skyloop.transport.local.portable import Registration, StreamSocket
-from skyloop.transport.local.system import PORTABLE, Credentials, System
+from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 pytestmark = [pytest.mark.side(PORTABLE), pytest.mark.usefixtures("side")]
@@ -390,7 +390,7 @@ def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> No
     room = threading.Event()
     here.on_room(room.set)
     with pytest.raises(BlockingIOError):
-        here.post(b"another")
+        here.send(b"another", here.post_flags)
     assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
     with pytest.raises(BlockingIOError):
         there.recv(MAX_PACKET, 1)
@@ -426,9 +426,9 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
     class Interrupted:
         def send(self, content: bytes) -> int:
             with pytest.raises(BlockingIOError):
-                here.post(b"inside")
+                here.send(b"inside", SEND_FLAGS)
             with pytest.raises(BlockingIOError):
-                here.send(b"inside")
+                here.send(b"inside", here.post_flags)
             return raw.send(content)
 
     here._socket = Interrupted()  # type: ignore[assignment]
@@ -437,7 +437,7 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
     assert there.recv(100) == b"outside"
     with here._sending:
         refused: list[bool] = []
-        thread = threading.Thread(target=lambda: refused.append(is_refused(lambda: here.post(b"x"))))
+        thread = threading.Thread(target=lambda: refused.append(is_refused(lambda: here.send(b"x", here.post_flags))))
         thread.start()
         thread.join()
         assert refused == [True], "it waits for no lock"

@@ -55,6 +55,8 @@ class Socket(socket.socket):
     can't be reused while a thread is sending on it.
     """
 
+    post_flags = SEND_FLAGS
+
     def __init__(self, fileno: int | None = None) -> None:
         super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno)
         self.settimeout(None)  # overrides socket.setdefaulttimeout()
@@ -69,9 +71,6 @@ class Socket(socket.socket):
     def accept(self) -> tuple[Socket, object]:
         accepted, address = super().accept()
         return Socket(accepted.detach()), address
-
-    def post(self, packet: bytes) -> None:
-        self.send(packet, SEND_FLAGS)
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", (descriptor,)))

@@ -40,6 +40,7 @@ from skyloop.transport.local.system import (
     CONNECT_TIMEOUT_S,
     HOST,
     PROXY,
+    SEND_FLAGS,
     Credentials,
     PacketSocket,
     StrangerError,
@@ -104,6 +105,8 @@ class _TcpSocket(socket.socket):
 class StreamSocket:
     """A TCP connection that carries packets; see :class:`skyloop.transport.local.system.PacketSocket`."""
 
+    post_flags = 0
+
     def __init__(self, sock: socket.socket, who: Credentials, backlog: int) -> None:
         self.who = who
         self._backlog = backlog
@@ -124,18 +127,14 @@ class StreamSocket:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def send(self, packet: bytes, flags: int = 0) -> int:  # noqa: ARG002  (never waits)
-        with self._sending:
-            self._send(packet)
-        return len(packet)
-
-    def post(self, packet: bytes) -> None:
-        if not self._sending.acquire(blocking=False):
+    def send(self, packet: bytes, flags: int = 0) -> int:
+        if not self._sending.acquire(blocking=flags != self.post_flags):
             raise BlockingIOError(errno.EAGAIN, "another thread is sending")
         try:
             self._send(packet)
         finally:
             self._sending.release()
+        return len(packet)
 
     def _send(self, packet: bytes) -> None:
         if self._inside:
@@ -275,7 +274,7 @@ class StreamSocket:
     def hang_up(self, last_packet: bytes = b"") -> None:
         if last_packet:
             with suppress(OSError):
-                self.send(last_packet)
+                self.send(last_packet, SEND_FLAGS)
         self._ended = True
         self._has_room = None
         with suppress(OSError):  # the connection had already ended
