@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import hashlib
 import hmac
 import itertools
@@ -407,6 +408,93 @@ def test_a_rest_ends_with_its_connection(pair: Pair) -> None:
     here.hang_up(b"bye")
     wait_until(lambda: not is_refused(lambda: here.recv(100)), "the connection has ended")
     assert here.recv(100) == b""
+
+
+def test_the_rest_is_sent_when_there_is_room(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same on this thread instead of its own."""
+    monkeypatch.setattr(_thread, "start_new_thread", lambda *_: None)
+    here, there, _ = pair
+    sent = 0
+    while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
+        sent += 1
+    room: list[bool] = []
+    here.on_room(lambda: room.append(True))
+    reader = threading.Thread(target=lambda: [there.recv(MAX_PACKET) for _ in range(sent)])
+    reader.start()
+    here._complete()
+    reader.join()
+    assert room == [True]
+    assert not here._rest
+
+
+def test_a_packet_can_wait_for_room(pair: Pair) -> None:
+    here, there, _ = pair
+    while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
+        pass
+    assert is_refused(lambda: here.send_within(b"late", 0.02))
+    reader = threading.Timer(0.05, lambda: [there.recv(MAX_PACKET) for _ in range(2)])
+    reader.start()
+    here.send_within(b"in time", 5.0)
+    reader.join()
+
+
+def test_without_threads_a_packet_in_part_ends_its_connection(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(_thread, "start_new_thread", fail)
+    here, _, _ = pair
+    with pytest.raises(ConnectionAbortedError, match="can't start new thread"):
+        [here.send(bytes(MAX_PACKET)) for _ in range(100)]
+    assert here.recv(100) == b""
+
+
+def test_descriptors_are_for_the_other_side(pair: Pair) -> None:
+    here, _, _ = pair
+    with pytest.raises(OSError, match="no descriptors"):
+        here.send_descriptor(b"x", 0)
+    with pytest.raises(LinkError, match="a descriptor over TCP"):
+        here.map_sealed(0, 100)
+
+
+def test_a_gate_out_of_descriptors_accepts_once_there_are_some(caplog: pytest.LogCaptureFixture) -> None:
+    class Full:
+        def accept(self) -> None:
+            raise OSError(24, "Too many open files")
+
+    with serving() as (server, log):
+        gate = server._listener
+        assert isinstance(gate, portable.Gate)
+        real, gate._listener = gate._listener, Full()  # type: ignore[assignment]
+        first, second = dial("alpha"), dial("alpha")
+        early = first(ClientLog())  # the thread is in the listener's call until then
+        wait_until(lambda: "cannot accept" in caplog.text, "it is reported")
+        gate._listener = real
+        late = second(ClientLog())
+        wait_until(lambda: len(log.joined) == 2, "both joined")
+        early.close()
+        late.close()
+
+
+def test_a_registration_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> bool:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", fail)
+        with pytest.raises(OSError, match="No space"):
+            LocalServer("alpha").start(ServerLog())
+    assert list(runtime_dir.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(portable, "try_lock", lambda _: False)
+        patch.setattr(portable, "_LOCKED_WITHIN_S", 0.01)
+        with pytest.raises(LinkError, match="locked by another process"):
+            LocalServer("alpha").start(ServerLog())
+    assert list(runtime_dir.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", fail)
+        live = portable.is_live(runtime_dir / "alpha.port")
+    assert live, "what can't be looked at is left alone"
 
 
 def test_a_stalled_readers_backlog_is_bounded(pair: Pair) -> None:
