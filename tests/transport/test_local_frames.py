@@ -122,6 +122,21 @@ def test_a_full_socket_gets_the_newest_at_its_next_release(exchange: FrameExchan
     assert [frame.header.seq for frame in viewer.frames] == [0, 2]
 
 
+def test_a_full_socket_gets_the_newest_when_it_has_room_after_all_releases(
+    exchange: FrameExchange, viewer: FakeConnection
+) -> None:
+    """TCP may have no room yet when the last release arrives: a stopped reader that continued never got the newest."""
+    publish(exchange, header(0))
+    viewer.full = True
+    assert publish(exchange, header(1)) == 1
+    assert exchange.release(viewer, viewer.frames[0].slot)
+    viewer.full = False
+    exchange.retry(viewer)
+    exchange.retry(viewer)
+    exchange.retry(FakeConnection())
+    assert [frame.header.seq for frame in viewer.frames] == [0, 1]
+
+
 def test_releasing_a_slot_not_held_changes_nothing(exchange: FrameExchange, viewer: FakeConnection) -> None:
     publish(exchange, header(0))
     slot = viewer.frames[0].slot

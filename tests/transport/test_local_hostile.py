@@ -36,8 +36,10 @@ def announce(raw: PacketSocket, slot: SlotMemory) -> None:
     """Send a slot's announcement, as a server does."""
 
     class Announcing:
-        transmit = staticmethod(raw.post)
         transmit_descriptor = staticmethod(raw.send_descriptor)
+
+        def transmit(self, packet: bytes) -> None:
+            raw.send(packet)
 
     slot.announce(Announcing(), 1)
 

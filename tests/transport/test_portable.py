@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import hashlib
 import hmac
 import itertools
@@ -27,7 +28,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
 from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
 from skyloop.transport.local.portable import Registration, StreamSocket
-from skyloop.transport.local.system import PORTABLE, Credentials, System
+from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 pytestmark = [pytest.mark.side(PORTABLE), pytest.mark.usefixtures("side")]
@@ -119,6 +120,7 @@ def test_strangers_are_turned_away_without_a_word(
         assert peer is NOBODY
         assert complaint in reason
         assert log.joined == []
+        monkeypatch.setattr(portable, "HANDSHAKE_S", 5.0)
         client = dial("alpha")(ClientLog())
         wait_until(lambda: log.joined, "others are let in")
         client.close()
@@ -274,12 +276,12 @@ def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> 
 
 @pytest.fixture
 def pair() -> Iterator[Pair]:
-    """Two ends, and the raw socket of the first."""
+    """A client's end and its server's, and the raw socket of the first."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
-        portable._limit_received(listener)
+        portable._limit_received(listener, portable._TO_SERVER)
         raw = socket.create_connection(listener.getsockname())
         there, _ = listener.accept()
-    ends = [StreamSocket(sock, Credentials(1, 1, 1)) for sock in (raw, there)]
+    ends = [StreamSocket(sock, Credentials(1, 1, 1), portable._TO_SERVER) for sock in (raw, there)]
     for end in ends:
         end.limit_backlog()
         end.limit_wait(5.0)
@@ -323,7 +325,7 @@ class Pieces(socket.socket):
         super().__init__()
         self._pieces, self._arrived = pieces, b""
 
-    def recv(self, size: int, flags: int = 0) -> bytes:  # type: ignore[override]
+    def recv(self, size: int, flags: int = 0) -> bytes:
         if not self._arrived:
             if not self._pieces:
                 return b""
@@ -341,7 +343,7 @@ def test_packets_cut_anywhere_arrive_whole(sent: list[bytes], cuts: list[int]) -
     places = sorted({0, len(content), *(cut for cut in cuts if cut < len(content))})
     pieces = [content[begin:end] for begin, end in itertools.pairwise(places)]
     with socket.socket() as unused, Pieces(pieces) as raw:
-        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end = StreamSocket(unused, Credentials(1, 1, 1), 0)
         end._socket.close()
         end._socket = raw  # type: ignore[assignment]
         received: list[bytes] = []
@@ -354,7 +356,7 @@ def test_packets_cut_anywhere_arrive_whole(sent: list[bytes], cuts: list[int]) -
 @given(st.binary(max_size=200))
 def test_any_bytes_are_packets_or_the_end(content: bytes) -> None:
     with socket.socket() as unused, Pieces([content] if content else []) as raw:
-        end = StreamSocket(unused, Credentials(1, 1, 1))
+        end = StreamSocket(unused, Credentials(1, 1, 1), 0)
         end._socket.close()
         end._socket = raw  # type: ignore[assignment]
         for _ in range(60):
@@ -386,12 +388,15 @@ def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> No
     assert time.monotonic() - began < 2.0
     assert 1 <= sent <= 8, "the backlog is bounded"
     assert here._rest, "the last one was sent in part"
+    room = threading.Event()
+    here.on_room(room.set)
     with pytest.raises(BlockingIOError):
-        here.post(b"another")
+        here.send(b"another", here.post_flags)
     assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
     with pytest.raises(BlockingIOError):
         there.recv(MAX_PACKET, 1)
-    wait_until(lambda: not here._rest, "it is complete")
+    assert room.wait(5.0)
+    assert not here._rest
     here.send(b"another")
     assert there.recv(100) == b"another"
 
@@ -403,6 +408,93 @@ def test_a_rest_ends_with_its_connection(pair: Pair) -> None:
     here.hang_up(b"bye")
     wait_until(lambda: not is_refused(lambda: here.recv(100)), "the connection has ended")
     assert here.recv(100) == b""
+
+
+def test_the_rest_is_sent_when_there_is_room(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same on this thread instead of its own."""
+    monkeypatch.setattr(_thread, "start_new_thread", lambda *_: None)
+    here, there, _ = pair
+    sent = 0
+    while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
+        sent += 1
+    room: list[bool] = []
+    here.on_room(lambda: room.append(True))
+    reader = threading.Thread(target=lambda: [there.recv(MAX_PACKET) for _ in range(sent)])
+    reader.start()
+    here._complete()
+    reader.join()
+    assert room == [True]
+    assert not here._rest
+
+
+def test_a_packet_can_wait_for_room(pair: Pair) -> None:
+    here, there, _ = pair
+    while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
+        pass
+    assert is_refused(lambda: here.send_within(b"late", 0.02))
+    reader = threading.Timer(0.05, lambda: [there.recv(MAX_PACKET) for _ in range(2)])
+    reader.start()
+    here.send_within(b"in time", 5.0)
+    reader.join()
+
+
+def test_without_threads_a_packet_in_part_ends_its_connection(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(_thread, "start_new_thread", fail)
+    here, _, _ = pair
+    with pytest.raises(ConnectionAbortedError, match="can't start new thread"):
+        [here.send(bytes(MAX_PACKET)) for _ in range(100)]
+    assert here.recv(100) == b""
+
+
+def test_descriptors_are_for_the_other_side(pair: Pair) -> None:
+    here, _, _ = pair
+    with pytest.raises(OSError, match="no descriptors"):
+        here.send_descriptor(b"x", 0)
+    with pytest.raises(LinkError, match="a descriptor over TCP"):
+        here.map_sealed(0, 100)
+
+
+def test_a_gate_out_of_descriptors_accepts_once_there_are_some(caplog: pytest.LogCaptureFixture) -> None:
+    class Full:
+        def accept(self) -> None:
+            raise OSError(24, "Too many open files")
+
+    with serving() as (server, log):
+        gate = server._listener
+        assert isinstance(gate, portable.Gate)
+        real, gate._listener = gate._listener, Full()  # type: ignore[assignment]
+        first, second = dial("alpha"), dial("alpha")
+        early = first(ClientLog())  # the thread is in the listener's call until then
+        wait_until(lambda: "cannot accept" in caplog.text, "it is reported")
+        gate._listener = real
+        late = second(ClientLog())
+        wait_until(lambda: len(log.joined) == 2, "both joined")
+        early.close()
+        late.close()
+
+
+def test_a_registration_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> bool:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", fail)
+        with pytest.raises(OSError, match="No space"):
+            LocalServer("alpha").start(ServerLog())
+    assert list(runtime_dir.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(portable, "try_lock", lambda _: False)
+        patch.setattr(portable, "_LOCKED_WITHIN_S", 0.01)
+        with pytest.raises(LinkError, match="locked by another process"):
+            LocalServer("alpha").start(ServerLog())
+    assert list(runtime_dir.iterdir()) == []
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "open", fail)
+        live = portable.is_live(runtime_dir / "alpha.port")
+    assert live, "what can't be looked at is left alone"
 
 
 def test_a_stalled_readers_backlog_is_bounded(pair: Pair) -> None:
@@ -422,9 +514,9 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
     class Interrupted:
         def send(self, content: bytes) -> int:
             with pytest.raises(BlockingIOError):
-                here.post(b"inside")
+                here.send(b"inside", SEND_FLAGS)
             with pytest.raises(BlockingIOError):
-                here.send(b"inside")
+                here.send(b"inside", here.post_flags)
             return raw.send(content)
 
     here._socket = Interrupted()  # type: ignore[assignment]
@@ -433,7 +525,7 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
     assert there.recv(100) == b"outside"
     with here._sending:
         refused: list[bool] = []
-        thread = threading.Thread(target=lambda: refused.append(is_refused(lambda: here.post(b"x"))))
+        thread = threading.Thread(target=lambda: refused.append(is_refused(lambda: here.send(b"x", here.post_flags))))
         thread.start()
         thread.join()
         assert refused == [True], "it waits for no lock"

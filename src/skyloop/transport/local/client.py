@@ -137,7 +137,7 @@ class LocalClient(TransportClient):
             return
         if not self._unsent:
             try:
-                sock.post(packet)
+                sock.send(packet, sock.post_flags)
             except BlockingIOError:
                 pass
             except OSError:

@@ -55,6 +55,8 @@ class Socket(socket.socket):
     can't be reused while a thread is sending on it.
     """
 
+    post_flags = SEND_FLAGS
+
     def __init__(self, fileno: int | None = None) -> None:
         super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno)
         self.settimeout(None)  # overrides socket.setdefaulttimeout()
@@ -69,9 +71,6 @@ class Socket(socket.socket):
     def accept(self) -> tuple[Socket, object]:
         accepted, address = super().accept()
         return Socket(accepted.detach()), address
-
-    def post(self, packet: bytes) -> None:
-        self.send(packet, SEND_FLAGS)
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", (descriptor,)))
@@ -111,6 +110,9 @@ class Socket(socket.socket):
 
     def limit_wait(self, seconds: float) -> None:
         set_timeout(self, socket.SO_RCVTIMEO, seconds)
+
+    def on_room(self, call: Callable[[], object]) -> None:
+        """Do nothing. When a client releases a frame, it has read that packet, so the next one fits."""
 
     def limit_backlog(self) -> None:
         self.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)

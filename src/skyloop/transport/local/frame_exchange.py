@@ -150,11 +150,15 @@ class Camera:
         if slot is None:
             return False
         self.drop(slot)
+        self.retry(viewer)
+        return True
+
+    def retry(self, viewer: Viewer) -> None:
+        """Send the newest frame to a viewer that waits for one."""
         if viewer.waits and self._newest is not None:
             viewer.hand(*self._newest, self.number)
             if not any(other.waits for other in self.viewers.values()):
                 self._keep(None)
-        return True
 
     def subscribe(self, connection: Connection) -> None:
         """Send frames to a connection from the next frame on."""
@@ -252,6 +256,13 @@ class FrameExchange:
                 if viewer is not None and camera.released(viewer, slot):
                     return True
         return False
+
+    def retry(self, connection: Connection) -> None:
+        """Send the newest frames to a client whose socket was full, and which has room again."""
+        with self._lock:
+            for camera in self._cameras.values():
+                if (viewer := camera.viewers.get(connection)) is not None:
+                    camera.retry(viewer)
 
     def leave(self, connection: Connection) -> None:
         """Remove a client that has left from all cameras."""

@@ -6,7 +6,7 @@ users of the host, and programs that took over the port of an ended server, lear
 its registration. The lock ends with the process and shows whether it still runs.
 
 Each packet follows its length in four bytes. If the kernel takes only a part of a packet, a thread sends the rest when
-there is room, and further packets are refused until then.
+there is room, and further packets are refused until then. The server is then told, so that it sends the newest frame.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from skyloop.transport.local.system import (
     CONNECT_TIMEOUT_S,
     HOST,
     PROXY,
+    SEND_FLAGS,
     Credentials,
     PacketSocket,
     StrangerError,
@@ -51,9 +52,10 @@ VERSION: Final = 1  #: of the registration and the handshake
 HANDSHAKE_S: Final = 2.0  #: time for both ends to prove that they know the secret
 MAX_STRANGERS: Final = 32  #: connections that have not done that yet; of more, the oldest is closed
 _HOST: Final = "127.0.0.1"
-#: Size of each end's buffer. On Linux, 290 packets of 66 bytes or 66 of 300 wait for a stalled reader, about as many as
-#: on the fast side. Larger packets are sent in part, and completed while the other end reads.
-_BUFFER: Final = 16_384
+#: Sizes of both ends' buffers towards the server and the client. On Linux, 290 set-points wait for a stalled server and
+#: 200 packets of 300 bytes for a stalled client, as on the fast side. Larger packets are completed while it reads.
+_TO_SERVER: Final = 16_384
+_TO_CLIENT: Final = 32_768
 _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
@@ -102,8 +104,11 @@ class _TcpSocket(socket.socket):
 class StreamSocket:
     """A TCP connection that carries packets; see :class:`skyloop.transport.local.system.PacketSocket`."""
 
-    def __init__(self, sock: socket.socket, who: Credentials) -> None:
+    post_flags = 0
+
+    def __init__(self, sock: socket.socket, who: Credentials, backlog: int) -> None:
         self.who = who
+        self._backlog = backlog
         self._socket = _TcpSocket(fileno=sock.detach())
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -113,49 +118,64 @@ class StreamSocket:
         self._sending = threading.RLock()
         self._inside = False  # whether a call that sends is under way
         self._rest = b""  # the unsent end of a packet that was sent in part
+        self._awaiting_room = False  # whether a thread waits until something fits again
+        self._has_room: Callable[[], object] | None = None
         self._partial = bytearray()  # the beginning of an incomplete packet, with its length
         self._ended = False
 
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def send(self, packet: bytes, flags: int = 0) -> int:  # noqa: ARG002  (never waits)
-        with self._sending:
-            self._send(packet)
-        return len(packet)
-
-    def post(self, packet: bytes) -> None:
-        if not self._sending.acquire(blocking=False):
+    def send(self, packet: bytes, flags: int = 0) -> int:
+        if not self._sending.acquire(blocking=flags != self.post_flags):
             raise BlockingIOError(errno.EAGAIN, "another thread is sending")
         try:
             self._send(packet)
         finally:
             self._sending.release()
+        return len(packet)
 
     def _send(self, packet: bytes) -> None:
-        if self._inside or self._rest:
-            raise BlockingIOError(errno.EAGAIN, "an earlier packet is not complete yet")
+        if self._inside:
+            raise BlockingIOError(errno.EAGAIN, "this thread is sending")
         self._inside = True
         try:
+            self._send_rest()
             content = len(packet).to_bytes(_LENGTH, "little") + packet
-            sent = self._socket.send(content)
-            if sent < len(content):
-                self._rest = content[sent:]
-                _thread.start_new_thread(self._complete, ())
-        except RuntimeError as error:  # no more threads
-            self.hang_up()
-            raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
+            self._rest = content[self._socket.send(content) :]
+        except BlockingIOError:
+            self._await_room()
+            raise
+        else:
+            if self._rest:
+                self._await_room()
         finally:
             self._inside = False
 
+    def _send_rest(self) -> None:
+        while self._rest:
+            self._rest = self._rest[self._socket.send(self._rest) :]
+
+    def _await_room(self) -> None:
+        if not self._awaiting_room:
+            self._awaiting_room = True
+            try:
+                _thread.start_new_thread(self._complete, ())
+            except RuntimeError as error:  # no more threads
+                self.hang_up()
+                raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
+
     def _complete(self) -> None:
-        """Send the rest of a packet as soon as there is room."""
+        """Send the rest of a packet as soon as there is room, and tell the server so."""
         with suppress(OSError, ValueError):  # the connection has ended, or was closed
             wait = _waiter(self._socket, to_send=True)
-            while self._rest and not self._ended:
+            while self._awaiting_room and not self._ended:
                 wait(_SLICE_MS)
                 with self._sending, suppress(BlockingIOError):
-                    self._rest = self._rest[self._socket.send(self._rest) :]
+                    self._send_rest()
+                    self._awaiting_room = False
+            if (has_room := self._has_room) is not None:
+                has_room()
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
         raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
@@ -244,14 +264,18 @@ class StreamSocket:
     def limit_wait(self, seconds: float) -> None:
         self._wait_s = seconds
 
+    def on_room(self, call: Callable[[], object]) -> None:
+        self._has_room = call
+
     def limit_backlog(self) -> None:
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         if last_packet:
             with suppress(OSError):
-                self.send(last_packet)
+                self.send(last_packet, SEND_FLAGS)
         self._ended = True
+        self._has_room = None
         with suppress(OSError):  # the connection had already ended
             self._socket.shutdown(socket.SHUT_RDWR)
 
@@ -330,7 +354,7 @@ def listen(path: Path, gid: int | None) -> Gate:
     try:
         if exclusive := getattr(socket, "SO_EXCLUSIVEADDRUSE", 0):  # Windows would let others listen on the same port
             listener.setsockopt(socket.SOL_SOCKET, exclusive, 1)
-        _limit_received(listener)
+        _limit_received(listener, _TO_SERVER)
         listener.bind((_HOST, 0))
         listener.listen(128)
         registration = Registration(listener.getsockname()[1], os.getpid(), os.urandom(32), prefix())
@@ -340,9 +364,9 @@ def listen(path: Path, gid: int | None) -> Gate:
         raise
 
 
-def _limit_received(sock: socket.socket) -> None:
+def _limit_received(sock: socket.socket, size: int) -> None:
     """Limit what waits in the kernel to be read. Must be called before the connection is made."""
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, size)
 
 
 def _register(path: Path, registration: Registration) -> int:
@@ -416,7 +440,7 @@ def connect(path: Path) -> StreamSocket:
         raise ConnectionRefusedError(errno.ECONNREFUSED, "its process has ended")
     sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
-        _limit_received(sock)
+        _limit_received(sock, _TO_CLIENT)
         sock.settimeout(CONNECT_TIMEOUT_S)
         sock.connect((_HOST, registration.port))
         _introduce(sock, registration, time.monotonic() + HANDSHAKE_S)
@@ -426,7 +450,7 @@ def connect(path: Path) -> StreamSocket:
     except BaseException:
         sock.close()
         raise
-    return StreamSocket(sock, Credentials(registration.pid, own_uid(), 0))
+    return StreamSocket(sock, Credentials(registration.pid, own_uid(), 0), _TO_SERVER)
 
 
 def _introduce(sock: socket.socket, registration: Registration, deadline_s: float) -> None:
@@ -445,7 +469,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
     while len(content) < size:
         sock.settimeout(max(1e-3, deadline_s - time.monotonic()))
         if not (more := sock.recv(size - len(content))):
-            raise ConnectionAbortedError(errno.ECONNABORTED, "it ended the connection: the secret is not its own")
+            raise ConnectionAbortedError(errno.ECONNABORTED, "it turned this process away")
         content += more
     return content
 
@@ -547,7 +571,7 @@ class Gate:
         found: StreamSocket | str = ""
         try:
             pid = _challenge(sock, self._registration, time.monotonic() + HANDSHAKE_S)
-            found = StreamSocket(sock, Credentials(pid, own_uid(), 0))
+            found = StreamSocket(sock, Credentials(pid, own_uid(), 0), _TO_CLIENT)
         except StrangerError as error:
             found = f"{_TURNED_AWAY}: {error}"
         except TimeoutError:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import partial
 from typing import Final
 
 from skyloop.errors import DecodeError, UsageError
@@ -296,6 +297,7 @@ class LocalServer(TransportServer):
             return None
         self._last_id += 1
         connection = ServerConnection(sock, Peer(self._last_id, str(who)), who)
+        sock.on_room(partial(self._exchange.retry, connection))
         with self._lock:
             self._connections.add(connection)
         return connection

@@ -52,6 +52,9 @@ class PacketSocket(Protocol):
     raises ``BlockingIOError``. The socket closes when nothing refers to it any more.
     """
 
+    #: Flags with which ``send`` waits for no lock either, because the garbage collector may call it at any point.
+    post_flags: int
+
     @property
     def who(self) -> Credentials: ...  # the process at the other end
     @property
@@ -60,9 +63,6 @@ class PacketSocket(Protocol):
     def recv(self) -> Callable[..., bytes]: ...  # of a size and flags; returns a packet cut to it, empty at the end
     def fileno(self) -> int: ...
     def close(self) -> None: ...
-
-    def post(self, packet: bytes) -> None:
-        """Send a packet without waiting for any lock, because the garbage collector may call this at any point."""
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:
         """Send a packet with a file descriptor."""
@@ -84,6 +84,9 @@ class PacketSocket(Protocol):
 
     def limit_wait(self, seconds: float) -> None:
         """Limit how long receiving waits [s]. 0 means no limit."""
+
+    def on_room(self, call: Callable[[], object]) -> None:
+        """Call a function on any thread when something fits again after a packet did not. Not all sides need this."""
 
     def limit_backlog(self) -> None:
         """Limit the data that waits to be read at the other end."""
