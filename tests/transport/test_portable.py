@@ -486,7 +486,7 @@ def test_a_registration_that_can_not_be_made_leaves_nothing(runtime_dir: Path, m
             LocalServer("alpha").start(ServerLog())
     assert list(runtime_dir.iterdir()) == []
     with monkeypatch.context() as patch:
-        patch.setattr(portable, "try_lock", lambda _: False)
+        patch.setattr("skyloop.platform.try_lock", lambda _: False)
         patch.setattr(portable, "_LOCKED_WITHIN_S", 0.01)
         with pytest.raises(LinkError, match="locked by another process"):
             LocalServer("alpha").start(ServerLog())
