@@ -10,13 +10,14 @@ PIP    := $(BIN)/python -m pip install --disable-pip-version-check $(if $(LOCKED
 # Where Python is told to keep nothing that it compiled, each process of the tests compiles the tests and the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-all test-core test-room explore check chaos docs fuzz format stubs coverage package page pictures lock clean
+.PHONY: help demo test test-all test-core test-room test-elsewhere explore check chaos docs fuzz format stubs coverage package page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests of every day, some 10 minutes; with ARGS, those that they select of all"
 	@echo "make test-all                                all tests"
 	@echo "make test-core                               the core's tests, without all that plugs into it, in 1 minute"
 	@echo "make test-room ROOM=client                   the tests of one room that start no processes"
+	@echo "make test-elsewhere                          some of them as on Windows and on macOS, two minutes each"
 	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
 	@echo "make check                                   lint, format, types, import contracts, budgets, prose"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
@@ -50,6 +51,17 @@ test-core:
 
 test-room: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto -m "not process and not slow" tests/$(or $(ROOM),$(error name a folder of tests/: make test-room ROOM=client)) $(ARGS)
+
+# On Linux, with processes that take it for another system (tests/support/elsewhere): what differs there, and a test of each
+# kind that starts processes.
+ELSEWHERE := tests/transport tests/client tests/test_child_process.py tests/test_files.py tests/host/test_own_process.py \
+  $(addprefix tests/integration/processes/test_,pilots.py recovery.py host.py) tests/recording/test_processes.py \
+  tests/cockpit/test_server.py tests/cli/test_demo.py tests/cli/test_fly.py
+test-elsewhere: $(VENV)/.installed-dev
+	for system in win32 darwin; do \
+	  SKYLOOP_PRETEND=$$system PYTHONPATH=tests/support/elsewhere $(BIN)/python -m pytest --numprocesses 4 -m "not slow" \
+	    $(ELSEWHERE) $(ARGS) || exit; \
+	done
 
 # New examples for the tests of properties, for a minute by default: make explore SECONDS=3600.
 SECONDS ?= 60

@@ -19,8 +19,10 @@ import pytest
 
 from skyloop.child_process import ChildProcess, RestartingChild, on_parent_end
 from skyloop.transport.testing import wait_until
+from tests.support.systems import PLATFORM
 
 SOURCE = Path(__file__).parents[1] / "src"
+KILLED = "ended with exit code 1" if PLATFORM == "win32" else "was killed by signal 9"
 
 
 @contextmanager
@@ -65,7 +67,9 @@ def test_a_child_that_does_not_end_is_terminated_and_finally_killed() -> None:
         with running(stubborn.format(handler), keep_errors=False) as child:
             child.stdout.readline()
             child.end(0.05, 20.0 if last is signal.SIGTERM else 0.05)
-            assert child.ending == f"was killed by signal {last.value}"
+            assert child.ending == (
+                "ended with exit code 1" if PLATFORM == "win32" else f"was killed by signal {last.value}"
+            )
             assert child.quoted_output == ""
 
 
@@ -155,7 +159,7 @@ def test_a_failed_restart_is_reported_and_retried(monkeypatch: pytest.MonkeyPatc
     assert first is not None
     first.kill()
     wait_until(lambda: child.child not in (None, first), "another one runs")
-    assert endings[0] == "was killed by signal 9"
+    assert endings[0] == KILLED
     assert "could not be started" in endings[1]
     assert "Too many open files" in endings[1]
     assert child.restarts == 2
@@ -201,4 +205,4 @@ def test_a_silent_child_is_killed() -> None:
     )
     child.start()
     wait_until(lambda: child.over, "it was killed")
-    assert endings == ["was killed by signal 9"]
+    assert endings == [KILLED]

@@ -17,8 +17,9 @@ import pytest
 
 from skyloop import platform
 from skyloop.child_process import ChildProcess
+from tests.support.systems import only_on
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="compares the sides of Linux and Windows")
+pytestmark = only_on("linux", reason="compares the sides of Linux and Windows, and pretends that itself")
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from skyloop.cli import doctor, main
 from skyloop.cli.doctor import Finding, Health, as_text
 from skyloop.errors import MissingExtraError
 from tests.support.commands import Run
+from tests.support.systems import PLATFORM
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +43,8 @@ def test_a_healthy_machine(run: Run) -> None:
     ended = run("doctor")
     assert ended.code == 0, ended.out
     assert "✓ Python: 3." in ended.out
-    assert f"sockets in {os.environ['SKYLOOP_RUNTIME_DIR']}" in ended.out
+    files = "sockets" if PLATFORM == "linux" else "registrations"
+    assert f"{files} in {os.environ['SKYLOOP_RUNTIME_DIR']}" in ended.out
     assert "driver sim://: skyloop.vehicles.sim" in ended.out
     assert "✗" not in ended.out
 

@@ -23,6 +23,7 @@ from skyloop.cli.text import named
 from skyloop.vehicles.video.v4l2 import CameraDevice, cameras, described
 from tests.support.commands import FAST_SIM, Run
 from tests.support.processes import Process, in_terminal
+from tests.support.systems import only_on
 
 ROOT = Path(__file__).parents[2]
 HOVER = """
@@ -76,6 +77,7 @@ def machine(tmp_path: Path, **names: tuple[str, str]) -> tuple[Path, Path]:
     return system, devices
 
 
+@only_on("linux", reason="reads the nodes in /sys and /dev")
 def test_cameras_are_listed_by_name_and_node(tmp_path: Path) -> None:
     system, devices = machine(
         tmp_path, video10=("Another", "0"), video2=("HD Webcam", "0"), video3=("HD Webcam", "1"), v4l=("no node", "0")

@@ -36,6 +36,7 @@ from skyloop.messages import EmergencyStop, Fate, FlightState, Hover, Land, Outc
 from tests.support.commands import Run
 from tests.support.processes import Process
 from tests.support.scripted_proxy import WAIT_S, ScriptedProxy, flown, scripted
+from tests.support.systems import only_on
 
 FLYING, LANDED, LANDING = FlightState.FLYING, FlightState.LANDED, FlightState.LANDING
 FORWARD = Deflection(forward=1)
@@ -350,6 +351,7 @@ def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     os.close(person)
 
 
+@only_on("linux", "darwin", reason="consoles have no terminal settings")
 def test_ctrl_z_and_ctrl_s_are_keys_and_the_shells_terminal_settings_are_undone(line: tuple[int, int]) -> None:
     person, program = line
     before = termios.tcgetattr(program)

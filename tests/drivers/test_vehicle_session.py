@@ -30,6 +30,7 @@ from skyloop.drivers.vehicle_session import (
     trouble_of,
 )
 from skyloop.errors import DriverError
+from tests.support.systems import only_on
 
 STEP_NS = 20_000_000
 
@@ -227,6 +228,7 @@ def test_a_file_is_not_a_port(tmp_path: Path) -> None:
     assert "is not a serial port" in serial_trouble(OSError(), str(tmp_path / "file"), "").reason
 
 
+@only_on("linux", "darwin", reason="ports have no modes and groups")
 @pytest.mark.parametrize(
     ("mode", "group", "remedy"),
     [

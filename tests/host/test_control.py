@@ -102,7 +102,7 @@ def test_a_large_answer_arrives_whole(served: Hosting) -> None:
 
 
 def test_other_users_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.transport.local.fast.may_connect", lambda sock, gid: False)
+    monkeypatch.setattr(find_directory().serving, "may_connect", lambda sock, gid: False)
     with pytest.raises(RefusedError, match=f"pid {os.getpid()}.*may not use the host"):
         ask("host", Remove("alpha"))
 

@@ -8,13 +8,17 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
-from skyloop.transport.local.system import FAST, PORTABLE, TRANSPORT_VARIABLE
+from skyloop.transport.local.system import FAST, PORTABLE, TRANSPORT_VARIABLE, systems
+
+BOTH = (FAST, PORTABLE)
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "side" in metafunc.fixturenames:
         only = metafunc.definition.get_closest_marker("side")
-        metafunc.parametrize("side", only.args if only is not None else (FAST, PORTABLE), indirect=True)
+        lacking = pytest.mark.skipif(FAST not in systems(), reason="this system lacks the fast side")
+        sides = [pytest.param(side, marks=[lacking] if side == FAST else []) for side in (only.args if only else BOTH)]
+        metafunc.parametrize("side", sides, indirect=True)
 
 
 @pytest.fixture

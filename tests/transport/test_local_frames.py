@@ -67,7 +67,7 @@ def shared_bytes() -> int:
     """Return the size of this process's mapped shared memory [bytes]."""
     total = 0
     for line in Path("/proc/self/maps").read_text().splitlines():
-        if "/memfd:skyloop" in line or "/dev/shm/sky-" in line:
+        if "/memfd:skyloop" in line or "/dev/shm/sky-" in line or "/memfd:as-on" in line:
             start, end = line.split()[0].split("-")
             total += int(end, 16) - int(start, 16)
     return total

@@ -16,6 +16,7 @@ from skyloop.transport.base import FEEDBACK, video
 from skyloop.transport.local import LocalServer, dial
 from skyloop.transport.local.client import LocalClient
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
+from tests.support.systems import only_on
 
 pytestmark = pytest.mark.usefixtures("side")
 _names = (f"lead-{number}" for number in itertools.count())
@@ -184,6 +185,7 @@ def test_a_signal_handlers_exception_reaches_the_waiting_thread_and_the_connecti
     assert pair.here.closings == []
 
 
+@only_on("linux", "darwin", reason="no process forks")
 def test_the_end_of_a_fork_leaves_the_connection_to_the_parent(pair: Pair) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12

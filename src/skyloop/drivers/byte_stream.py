@@ -25,6 +25,7 @@ _BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including sta
 _DRAIN_S: Final = 0.1  # time limit for closing one connection before opening the next
 END_S: Final = 0.5  #: time limit for the last close; TCP resends a lost packet after 0.2 s
 _UNACKNOWLEDGED_MS: Final = 2500  # time without acknowledgement after which TCP drops the connection
+_WINDOWS_BUFFER: Final = 4096  # of a TCP connection there [bytes], because what waits in it can't be counted
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes are unsent this long after they were due
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and by then has resent lost packets
 #: Size of the longest frame in MAVLink and MSP [bytes]. The parser of a flight controller consumes as many bytes as a
@@ -215,6 +216,8 @@ class TcpStream(ByteStream):
         if hasattr(socket, "TCP_USER_TIMEOUT"):  # not available on macOS
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNACKNOWLEDGED_MS)
         self._socket.setblocking(False)
+        if sys.platform == "win32":
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _WINDOWS_BUFFER)
 
     def fileno(self) -> int:
         return self._socket.fileno()
@@ -233,8 +236,14 @@ class TcpStream(ByteStream):
 
     def close(self) -> None:
         """Close the connection and discard unacknowledged data, which the system would otherwise resend for minutes."""
-        if not self._drain():
-            with suppress(OSError):
+        drained = self._drain()
+        with suppress(OSError):
+            if sys.platform == "win32":
+                # Closing a blocking socket waits for up to this second, and then resets the connection.
+                # learn.microsoft.com/windows/win32/api/winsock/nf-winsock-closesocket
+                self._socket.setblocking(True)
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("HH", 1, 1))
+            elif not drained:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 

@@ -4,13 +4,12 @@
 
 Python imports this module at its start. Modules of ``skyloop``, and only those, get stand-ins for the modules of the
 standard library that differ: names that the other system lacks are missing, and the few that only it has are imitated
-where the imitation is simple (locks, named memory, pipes, ending processes). Libraries and the tests keep the real
-ones. This shows what Skyloop itself needs; it shows nothing about other libraries, paths or file permissions there.
+where the imitation is simple (locks, named memory, pipes, ending processes, files in use). Libraries and the tests keep
+the real ones. This shows what Skyloop itself needs, and nothing about other libraries, paths or file permissions there.
 """
 
 from __future__ import annotations
 
-import atexit
 import builtins
 import contextlib
 import importlib.abc
@@ -23,7 +22,7 @@ import socket
 import subprocess
 import sys
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,34 +77,61 @@ class _StandIn(types.ModuleType):
         return getattr(self._real, name)
 
     def __setattr__(self, name: str, value: Any) -> None:  # tests replace attributes
-        self.__dict__[name] = value
-        setattr(self._real, name, value)
+        if name in self.__dict__:  # differs from the real module's
+            self.__dict__[name] = value
+        else:
+            setattr(self._real, name, value)
 
     def __dir__(self) -> list[str]:
         return [name for name in dir(self._real) if name not in self._missing]
 
 
 class TaggedMemory(mmap.mmap):
-    """Memory with a name, as on Windows, where it is free when no one uses it any more."""
+    """Memory with a name, as on Windows: an unknown name makes it, and the end of its last user frees it."""
 
     def __new__(
         cls, number: int, length: int, *args: Any, tagname: str = "", access: int = 0, **more: Any
     ) -> TaggedMemory:
         if not tagname:
             return super().__new__(cls, number, length, *args, access=access, **more)
-        path = f"/dev/shm/as-on-windows-{tagname}"
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-        if os.fstat(file).st_size == 0:
+        name = f"as-on-windows-{tagname}"
+        file = _in_use(f"/memfd:{name} (deleted)")
+        if file is None:
+            file = os.memfd_create(name)
             os.ftruncate(file, length)
-            atexit.register(_remove, path)
-        found = super().__new__(cls, file, length, access=access)
-        os.close(file)
-        return found
+        try:
+            return super().__new__(cls, file, length, access=access)  # keeps a duplicate of the descriptor
+        finally:
+            os.close(file)
 
 
-def _remove(path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):
-        Path(path).unlink()
+def _in_use(link: str) -> int | None:
+    """Open what any process has open under this name."""
+    for path in _open_as(link):
+        with contextlib.suppress(OSError):
+            return os.open(path, os.O_RDWR)
+    return None
+
+
+def _open_as(link: str) -> Iterator[Path]:
+    for path in Path("/proc").glob("[0-9]*/fd/*"):
+        with contextlib.suppress(OSError):
+            if str(path.readlink()) == link:
+                yield path
+
+
+def _hold_open_files(event: str, given: tuple[Any, ...]) -> None:
+    """Let no module of Skyloop remove or rename a file that a process has open, nor rename another one to its name."""
+    if event not in ("os.remove", "os.rename"):
+        return
+    frame: types.FrameType | None = sys._getframe(1)
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("pathlib", "os"):
+        frame = frame.f_back
+    if frame is None or not frame.f_globals.get("__name__", "").startswith("skyloop."):
+        return
+    for path in given[: 2 if event == "os.rename" else 1]:
+        if next(_open_as(os.path.realpath(path)), None) is not None:
+            raise PermissionError(13, "The process cannot access the file because it is being used", str(path))
 
 
 class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
@@ -117,13 +143,20 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
         super().__init__(*args, start_new_session=bool(creationflags & 0x200), **more)
 
     def terminate(self) -> None:
-        self.kill()
+        super().send_signal(signal.SIGKILL)
+
+    kill = terminate
 
     def send_signal(self, sig: int) -> None:
         if sig == signal.SIGTERM:
-            self.kill()
+            self.terminate()
         elif sig:
             raise ValueError(f"unsupported signal: {sig}")
+
+    def _handle_exitstatus(self, sts: int, *args: Any, **more: Any) -> None:
+        super()._handle_exitstatus(sts, *args, **more)  # type: ignore[misc]
+        if self.returncode is not None and self.returncode < 0:
+            self.returncode = 1  # as ``TerminateProcess`` is told to say
 
 
 def _locking(descriptor: int, mode: int, _: int) -> None:
@@ -217,3 +250,5 @@ if PRETEND:
     if PRETEND not in _MISSING:
         sys.exit(f"SKYLOOP_PRETEND is {PRETEND!r} and must be one of {', '.join(_MISSING)}")
     sys.meta_path.insert(0, _Finder(PRETEND))
+    if PRETEND == "win32":
+        sys.addaudithook(_hold_open_files)

@@ -1,0 +1,22 @@
+"""Tests that mean something on some systems only, real or pretended (``elsewhere/sitecustomize.py``)."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+#: What Skyloop takes for its system.
+PLATFORM = os.environ.get("SKYLOOP_PRETEND") or sys.platform
+
+
+def only_on(*systems: str, reason: str) -> pytest.MarkDecorator:
+    """Skip a test on all other systems. ``reason``: what they lack, or what the test reads there."""
+    return pytest.mark.skipif(PLATFORM not in systems, reason=f"not on {PLATFORM}: {reason}")
+
+
+def served_files(folder: Path) -> list[str]:
+    """Return what is in a directory of proxies, except for the lock of Windows, where no directory can be locked."""
+    return sorted(path.name for path in folder.iterdir() if PLATFORM != "win32" or path.name != ".lock")
