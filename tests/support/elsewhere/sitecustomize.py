@@ -13,6 +13,7 @@ from __future__ import annotations
 import atexit
 import builtins
 import contextlib
+import errno
 import importlib.abc
 import importlib.machinery
 import mmap
@@ -22,8 +23,9 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +128,70 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
             raise ValueError(f"unsupported signal: {sig}")
 
 
+def _fsync(file: Any) -> None:
+    """Flush a file that is open for writing; others can't be flushed."""
+    import fcntl
+
+    if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+    os.fsync(file)
+
+
+def _link(source: Any, target: Any, *, follow_symlinks: bool = True) -> None:
+    if not follow_symlinks:
+        raise NotImplementedError("link: follow_symlinks unavailable on this platform")
+    os.link(source, target)
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Wait as on Windows before Python 3.14, where Ctrl-C does not end a wait for a lock."""
+    signals = {signal.SIGINT, signal.SIGTERM}
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _WindowsEvent(threading.Event):
+    def wait(self, timeout: float | None = None) -> bool:
+        with _uninterrupted():
+            return super().wait(timeout)
+
+
+class _WindowsCondition(threading.Condition):
+    def wait(self, timeout: float | None = None) -> bool:
+        with _uninterrupted():
+            return super().wait(timeout)
+
+
+class _WindowsThread(threading.Thread):
+    def join(self, timeout: float | None = None) -> None:
+        with _uninterrupted():
+            super().join(timeout)
+
+
+def _key_pressed() -> bool:
+    """Return whether a key waits to be read, in a terminal that sends each one at once."""
+    import termios
+    import tty
+
+    if termios.tcgetattr(0)[3] & termios.ICANON:
+        tty.setcbreak(0, termios.TCSANOW)
+    poll = select.poll()
+    poll.register(0, select.POLLIN)
+    return bool(poll.poll(0))
+
+
+def _kill(pid: int, number: int) -> None:
+    """Send Ctrl-C to a group (signal 0), or end a process, whatever the signal."""
+    raise AssertionError(f"os.kill({pid}, {number}) would end the process on Windows")
+
+
 def _locking(descriptor: int, mode: int, _: int) -> None:
     import fcntl
 
@@ -157,11 +223,13 @@ def _windows() -> dict[str, types.ModuleType]:
     )
     console = types.ModuleType("msvcrt")
     console.__dict__.update(LK_NBLCK=2, locking=_locking, get_osfhandle=lambda descriptor: descriptor)
+    console.__dict__.update(kbhit=_key_pressed, getwch=lambda: os.read(0, 1).decode("latin-1"))
     return {
         "msvcrt": console,
         "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
         "subprocess": _StandIn(subprocess, (), Popen=_WindowsPopen),
         "asyncio": _StandIn(asyncio, ()),
+        "threading": _StandIn(threading, (), Event=_WindowsEvent, Condition=_WindowsCondition, Thread=_WindowsThread),
     }
 
 
@@ -177,6 +245,7 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
     if system == "win32":
         found |= _windows()
         found["mmap"].__dict__["mmap"] = TaggedMemory
+        found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)
     return found
 
 
