@@ -19,13 +19,15 @@ import importlib.machinery
 import mmap
 import os
 import select
+import selectors
 import signal
 import socket
+import stat
 import subprocess
 import sys
 import threading
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +128,56 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
             self.kill()
         elif sig:
             raise ValueError(f"unsupported signal: {sig}")
+
+
+def _is_open(path: Any) -> bool:
+    """Return whether any process has this file open. Python opens files on Windows so that no one can remove them."""
+    place = os.path.realpath(path)
+    for descriptors in Path("/proc").glob("[0-9]*/fd"):
+        with contextlib.suppress(OSError):  # another user's process, or one that has just ended
+            for descriptor in descriptors.iterdir():
+                with contextlib.suppress(OSError):
+                    if str(descriptor.readlink()) == place:
+                        return True
+    return False
+
+
+def _keep_open_files() -> None:
+    """Let Skyloop neither remove nor replace a file that is open."""
+
+    def guarded(owner: Any, name: str) -> Callable[..., Any]:
+        real = getattr(owner, name)
+
+        def call(*paths: Any, **more: Any) -> Any:
+            if sys._getframe(1).f_globals.get("__name__", "").startswith("skyloop"):
+                for path in paths:
+                    if Path(path).is_file() and _is_open(path):
+                        raise PermissionError(errno.EACCES, "in use by another process (WinError 32)", str(path))
+            return real(*paths, **more)
+
+        return call
+
+    for name in ("unlink", "rename", "replace"):
+        setattr(Path, name, guarded(Path, name))
+        setattr(os, name, guarded(os, name))
+    os.remove = guarded(os, "remove")
+
+
+def _only_sockets(*waited: Any) -> Any:
+    """Wait as ``select.select`` does on Windows: for sockets, of which there must be one."""
+    for each in (found := [*waited[0], *waited[1]]):
+        if not stat.S_ISSOCK(os.fstat(each if isinstance(each, int) else each.fileno()).st_mode):
+            raise OSError(errno.ENOTSOCK, f"{each} is not a socket (WinError 10038)")
+    if not found:
+        raise OSError(errno.EINVAL, "no socket to wait for (WinError 10022)")
+    with _uninterrupted():
+        return select.select(*waited)
+
+
+class _WindowsSelector(selectors.SelectSelector):
+    def _select(self, readers: Any, writers: Any, _: Any, timeout: float | None = None) -> Any:
+        readers, writers, failed = _only_sockets(readers, writers, writers, timeout)
+        return readers, writers + failed, []
 
 
 def _fsync(file: Any) -> None:
@@ -229,6 +281,7 @@ def _windows() -> dict[str, types.ModuleType]:
         "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
         "subprocess": _StandIn(subprocess, (), Popen=_WindowsPopen),
         "asyncio": _StandIn(asyncio, ()),
+        "selectors": _StandIn(selectors, (), DefaultSelector=_WindowsSelector),
         "threading": _StandIn(threading, (), Event=_WindowsEvent, Condition=_WindowsCondition, Thread=_WindowsThread),
     }
 
@@ -245,6 +298,8 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
     if system == "win32":
         found |= _windows()
         found["mmap"].__dict__["mmap"] = TaggedMemory
+        found["select"].__dict__["select"] = _only_sockets
+        found["signal"].__dict__["SIGBREAK"] = signal.SIGUSR1
         found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)
     return found
 
@@ -286,3 +341,5 @@ if PRETEND:
     if PRETEND not in _MISSING:
         sys.exit(f"SKYLOOP_PRETEND is {PRETEND!r} and must be one of {', '.join(_MISSING)}")
     sys.meta_path.insert(0, _Finder(PRETEND))
+    if PRETEND == "win32":
+        _keep_open_files()
