@@ -131,6 +131,7 @@ def test_terminating_on_windows_leaves_a_child_time_to_end(monkeypatch: pytest.M
     assert child.stdout.readline() == b"up\n"
     with monkeypatch.context() as windows:
         windows.setattr(sys, "platform", "win32")
+        windows.setattr(child._process, "terminate", child._process.kill)
         child.terminate()
         assert child.stdout.readline() == b"lands first\n"
         assert child.wait(20.0) == 0
