@@ -117,6 +117,32 @@ def test_the_end_of_the_parents_pipe_is_detected() -> None:
     assert never_open.wait(20.0), "a pipe that can't be read is as good as ended"
 
 
+def test_terminating_on_windows_leaves_a_child_time_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There, ending a process kills it. A host's vehicle in a process of its own was left in the air."""
+    code = (
+        "import signal, sys, threading\n"
+        "from skyloop.child_process import on_parent_end\n"
+        "sys.platform = 'win32'\n"
+        "asked = threading.Event()\n"
+        "signal.signal(signal.SIGTERM, lambda *_: asked.set())\n"
+        "on_parent_end(asked.set)\n"
+        "print('up', flush=True)\n"
+        "while not asked.wait(0.05):\n"
+        "    pass\n"
+        "print('lands first', flush=True)"
+    )
+    child = ChildProcess([sys.executable, "-c", code])
+    assert child.stdout.readline() == b"up\n"
+    with monkeypatch.context() as windows:
+        windows.setattr(sys, "platform", "win32")
+        windows.setattr(child._process, "terminate", child._process.kill)
+        child.terminate()
+        assert child.stdout.readline() == b"lands first\n"
+        assert child.wait(20.0) == 0
+        child.terminate()
+    child.close()
+
+
 def test_a_fork_leaves_the_child_of_its_parent_alone() -> None:
     """A fork of this process ends its copy of the object; the child process continues."""
     code = "import sys; print('x', flush=True); sys.stdin.read(); print('y', flush=True)"

@@ -64,6 +64,19 @@ def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["x.txt"]
 
 
+def test_a_file_is_flushed_as_windows_demands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There, ``FlushFileBuffers`` needs write access, and Python reports a bad descriptor without it."""
+    fcntl = pytest.importorskip("fcntl")
+    flushed: list[int] = []
+
+    def fsync(descriptor: int) -> None:
+        flushed.append(fcntl.fcntl(descriptor, fcntl.F_GETFL) & os.O_ACCMODE)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write(tmp_path / "x.txt", b"new")
+    assert flushed == [os.O_RDWR]
+
+
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     path = tmp_path / "x.txt"
     path.write_bytes(b"old")

@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import weakref
@@ -29,6 +30,7 @@ _CHECK_S: Final = 0.25  # how often to check a child that may hang silently
 _DRAIN_S: Final = 1.0
 #: Variable that passes data to a child. Only its user can read its environment, but all users can read command lines.
 _HANDED: Final = "SKYLOOP_HANDED_OVER"
+_TERMINATE: Final = b"terminate\n"  # on a child's standard input, on Windows
 _log = logging.getLogger(__name__)
 
 
@@ -137,9 +139,18 @@ class ChildProcess:
             self._process.stdin.close()
 
     def terminate(self) -> None:
-        """Send SIGTERM to the child; on Windows, kill it. Does not wait. Idempotent."""
-        if self._ours:
-            self._process.terminate()
+        """Send SIGTERM to the child. Does not wait. Idempotent.
+
+        On Windows, ``TerminateProcess`` would kill it, and a flying vehicle could not land. There, a line on its
+        standard input makes :func:`on_parent_end` raise the signal.
+        """
+        if sys.platform != "win32":
+            if self._ours:
+                self._process.terminate()
+        elif self._ours and self._process.stdin is not None:
+            with suppress(OSError, ValueError):  # it has ended, or was already asked to exit
+                self._process.stdin.write(_TERMINATE)
+                self._process.stdin.flush()
 
     def kill(self) -> None:
         """Kill the child. Does not wait. Idempotent."""
@@ -335,13 +346,16 @@ class RestartingChild:
 def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     """In a child: call ``stop`` on a separate thread when the parent's end of a pipe closes.
 
+    On Windows, a line in the pipe raises SIGTERM (:meth:`ChildProcess.terminate`).
+
     ``descriptor`` is the reading end of the pipe; the default is standard input, as in a :class:`ChildProcess`.
     """
 
     def watch() -> None:
         with suppress(OSError):  # if the pipe can't be read, treat it as closed
-            while os.read(descriptor, 64):
-                pass
+            while data := os.read(descriptor, 64):
+                if sys.platform == "win32" and data == _TERMINATE:
+                    signal.raise_signal(signal.SIGTERM)
         stop()
 
     threading.Thread(target=watch, name="skyloop-parent", daemon=True).start()

@@ -91,7 +91,7 @@ def write(path: Path, content: bytes) -> None:
 
 
 def _settle(part: Path, place: Path) -> None:
-    with part.open("rb") as file:
+    with part.open("r+b") as file:  # Windows flushes only files that are open for writing
         os.fsync(file.fileno())
     if place.exists():
         shutil.copymode(place, part)

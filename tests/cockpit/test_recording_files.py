@@ -285,3 +285,16 @@ def test_a_move_that_would_overwrite_is_refused(folder: Path) -> None:
     notes_path(folder / "new.mcap").write_text("{}")
     with pytest.raises(RefusedError, match="notes"):
         recording_files.rename(folder / "flight.mcap", "new")
+
+
+def test_a_recording_is_renamed_where_links_have_fewer_options(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def link(*_: object, follow_symlinks: bool = True) -> None:
+        assert not follow_symlinks
+        raise NotImplementedError("link: follow_symlinks unavailable on this platform")
+
+    monkeypatch.setattr("os.link", link)
+    with pytest.raises(RefusedError, match="already"):
+        recording_files.rename(folder / "flight.mcap", "other")
+    recording_files.rename(folder / "flight.mcap", "moved")
+    assert (folder / "moved.mcap").exists()
+    assert not (folder / "flight.mcap").exists()

@@ -17,7 +17,7 @@ from skyloop.clock import monotonic_ns
 from skyloop.errors import DriverError, UsageError
 from skyloop.messages import EventKind, Takeoff
 from skyloop.proxy import Proxy
-from skyloop.proxy.serve import run, serve
+from skyloop.proxy.serve import Shutdown, on_signals, run, serve
 from skyloop.transport.local import LocalServer, dial
 from tests.proxy.toy_process import Toy
 from tests.support.proxy_bench import WAIT_S, App
@@ -96,6 +96,17 @@ def test_a_signal_lands_first_and_has_a_reason(start: Start, number: signal.Sign
     assert number.name in closing.text
     assert next(event for event in app.events if event.kind is EventKind.FAILSAFE).data["reason"] == "closing"
     app.end.close()
+
+
+def test_ctrl_break_is_a_signal_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, as is the end of the console; there, it ended the proxy without a landing."""
+    monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
+    monkeypatch.setattr(sys, "platform", "win32")
+    shutdown = Shutdown()
+    with on_signals(shutdown, ignore_interrupt=False):
+        signal.raise_signal(signal.SIGUSR1)
+        assert shutdown.requested.is_set()
+        assert not shutdown.hurry.is_set()
 
 
 def test_the_end_of_the_parent_lands_a_flying_vehicle(start: Start) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import errno
 import hashlib
 import hmac
 import itertools
@@ -28,7 +29,7 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
 from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
 from skyloop.transport.local.portable import Registration, StreamSocket
-from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System
+from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System, systems
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 from tests.support.systems import PLATFORM, only_on
 
@@ -525,7 +526,7 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
 
     here._socket = Interrupted()  # type: ignore[assignment]
     here.send(b"outside")
-    here._socket = raw  # type: ignore[assignment]
+    here._socket = raw
     assert there.recv(100) == b"outside"
     with here._sending:
         refused: list[bool] = []
@@ -749,3 +750,29 @@ def test_a_forks_copy_of_a_slot_removes_nothing() -> None:
         os._exit(mine == slot._owner.prefix)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
     assert named(slot._name) == [slot._name]
+
+
+def test_a_process_out_of_descriptors_does_not_settle_on_the_portable_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For its whole life, it would have seen no proxy of the fast side, and served under a name that one has."""
+    sides = systems()
+    systems.cache_clear()
+
+    def fail(number: int) -> Callable[..., object]:
+        def socketpair(*_: object) -> object:
+            raise OSError(number, os.strerror(number))
+
+        return socketpair
+
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(socket, "socketpair", fail(errno.EMFILE))
+            with pytest.raises(LinkError, match="Too many open files"):
+                systems()
+        assert list(systems()) == list(sides)
+        with monkeypatch.context() as patch:
+            systems.cache_clear()
+            patch.setattr(socket, "socketpair", fail(errno.EPROTONOSUPPORT))
+            assert list(systems()) == [PORTABLE]
+    finally:
+        systems.cache_clear()
+        assert list(systems()) == list(sides)

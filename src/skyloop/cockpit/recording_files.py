@@ -223,7 +223,7 @@ def _move_one(path: Path, target: Path) -> None:
         os.link(path, target, follow_symlinks=False)  # never overwrites, unlike a rename
     except FileExistsError:
         raise
-    except OSError:  # the file system does not support hard links
+    except (OSError, NotImplementedError):  # the file system or the platform does not support such hard links
         if target.exists():
             raise FileExistsError from None
         path.rename(target)

@@ -160,7 +160,7 @@ class AuditTrail:
         self._queue: SimpleQueue[Entry | None] = SimpleQueue()
         self._failed = False
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, _MODE)
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), _MODE)
         self._thread = threading.Thread(target=self._write_all, name="skyloop-audit", daemon=True)
         self._thread.start()
 

@@ -257,15 +257,17 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end of the process. Main thread only."""
+    """Make SIGINT (unless the parent handles it) and SIGTERM request the end of the process. Main thread only.
+
+    On Windows, so does SIGBREAK, which Ctrl-Break and the closing of the console's window cause.
+    """
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
 
-    before = {
-        signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else asked),
-        signal.SIGTERM: signal.signal(signal.SIGTERM, asked),
-    }
+    interrupts = (signal.SIGINT, *([signal.SIGBREAK] if sys.platform == "win32" else []))
+    before = {one: signal.signal(one, signal.SIG_IGN if ignore_interrupt else asked) for one in interrupts}
+    before[signal.SIGTERM] = signal.signal(signal.SIGTERM, asked)
     try:
         yield
     finally:

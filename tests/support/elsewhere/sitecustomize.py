@@ -12,17 +12,21 @@ from __future__ import annotations
 
 import builtins
 import contextlib
+import errno
 import importlib.abc
 import importlib.machinery
 import mmap
 import os
 import select
+import selectors
 import signal
 import socket
+import stat
 import subprocess
 import sys
+import threading
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +97,7 @@ class TaggedMemory(mmap.mmap):
         cls, number: int, length: int, *args: Any, tagname: str = "", access: int = 0, **more: Any
     ) -> TaggedMemory:
         if not tagname:
-            return super().__new__(cls, number, length, *args, access=access, **more)
+            return super().__new__(cls, number, length, *args, access=access, **more)  # type: ignore[misc]
         name = f"as-on-windows-{tagname}"
         file = _in_use(f"/memfd:{name} (deleted)")
         if file is None:
@@ -159,6 +163,120 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
             self.returncode = 1  # as ``TerminateProcess`` is told to say
 
 
+def _is_open(path: Any) -> bool:
+    """Return whether any process has this file open. Python opens files on Windows so that no one can remove them."""
+    place = os.path.realpath(path)
+    for descriptors in Path("/proc").glob("[0-9]*/fd"):
+        with contextlib.suppress(OSError):  # another user's process, or one that has just ended
+            for descriptor in descriptors.iterdir():
+                with contextlib.suppress(OSError):
+                    if str(descriptor.readlink()) == place:
+                        return True
+    return False
+
+
+def _keep_open_files() -> None:
+    """Let Skyloop neither remove nor replace a file that is open."""
+
+    def guarded(owner: Any, name: str) -> Callable[..., Any]:
+        real = getattr(owner, name)
+
+        def call(*paths: Any, **more: Any) -> Any:
+            if sys._getframe(1).f_globals.get("__name__", "").startswith("skyloop"):
+                for path in paths:
+                    if Path(path).is_file() and _is_open(path):
+                        raise PermissionError(errno.EACCES, "in use by another process (WinError 32)", str(path))
+            return real(*paths, **more)
+
+        return call
+
+    for name in ("unlink", "rename", "replace"):
+        setattr(Path, name, guarded(Path, name))
+        setattr(os, name, guarded(os, name))
+    os.remove = guarded(os, "remove")
+
+
+def _only_sockets(*waited: Any) -> Any:
+    """Wait as ``select.select`` does on Windows: for sockets, of which there must be one."""
+    for each in (found := [*waited[0], *waited[1]]):
+        if not stat.S_ISSOCK(os.fstat(each if isinstance(each, int) else each.fileno()).st_mode):
+            raise OSError(errno.ENOTSOCK, f"{each} is not a socket (WinError 10038)")
+    if not found:
+        raise OSError(errno.EINVAL, "no socket to wait for (WinError 10022)")
+    with _uninterrupted():
+        return select.select(*waited)
+
+
+class _WindowsSelector(selectors.SelectSelector):
+    def _select(self, readers: Any, writers: Any, _: Any, timeout: float | None = None) -> Any:
+        readers, writers, failed = _only_sockets(readers, writers, writers, timeout)
+        return readers, writers + failed, []
+
+
+def _fsync(file: Any) -> None:
+    """Flush a file that is open for writing; others can't be flushed."""
+    import fcntl
+
+    if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDONLY:
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+    os.fsync(file)
+
+
+def _link(source: Any, target: Any, *, follow_symlinks: bool = True) -> None:
+    if not follow_symlinks:
+        raise NotImplementedError("link: follow_symlinks unavailable on this platform")
+    os.link(source, target)
+
+
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Wait as on Windows before Python 3.14, where Ctrl-C does not end a wait for a lock."""
+    signals = {signal.SIGINT, signal.SIGTERM}
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _WindowsEvent(threading.Event):
+    def wait(self, timeout: float | None = None) -> bool:
+        with _uninterrupted():
+            return super().wait(timeout)
+
+
+class _WindowsCondition(threading.Condition):
+    def wait(self, timeout: float | None = None) -> bool:
+        with _uninterrupted():
+            return super().wait(timeout)
+
+
+class _WindowsThread(threading.Thread):
+    def join(self, timeout: float | None = None) -> None:
+        with _uninterrupted():
+            super().join(timeout)
+
+
+def _key_pressed() -> bool:
+    """Return whether a key waits to be read, in a terminal that sends each one at once."""
+    import termios
+    import tty
+
+    if termios.tcgetattr(0)[3] & termios.ICANON:
+        tty.setcbreak(0, termios.TCSANOW)
+    poll = select.poll()
+    poll.register(0, select.POLLIN)
+    return bool(poll.poll(0))
+
+
+def _kill(pid: int, number: int) -> None:
+    """Send Ctrl-C to a group (signal 0), or end a process, whatever the signal."""
+    raise AssertionError(f"os.kill({pid}, {number}) would end the process on Windows")
+
+
 def _locking(descriptor: int, mode: int, _: int) -> None:
     import fcntl
 
@@ -190,11 +308,14 @@ def _windows() -> dict[str, types.ModuleType]:
     )
     console = types.ModuleType("msvcrt")
     console.__dict__.update(LK_NBLCK=2, locking=_locking, get_osfhandle=lambda descriptor: descriptor)
+    console.__dict__.update(kbhit=_key_pressed, getwch=lambda: os.read(0, 1).decode("latin-1"))
     return {
         "msvcrt": console,
         "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
         "subprocess": _StandIn(subprocess, (), Popen=_WindowsPopen),
         "asyncio": _StandIn(asyncio, ()),
+        "selectors": _StandIn(selectors, (), DefaultSelector=_WindowsSelector),
+        "threading": _StandIn(threading, (), Event=_WindowsEvent, Condition=_WindowsCondition, Thread=_WindowsThread),
     }
 
 
@@ -210,6 +331,9 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
     if system == "win32":
         found |= _windows()
         found["mmap"].__dict__["mmap"] = TaggedMemory
+        found["select"].__dict__["select"] = _only_sockets
+        found["signal"].__dict__["SIGBREAK"] = signal.SIGUSR1
+        found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)
     return found
 
 
@@ -251,4 +375,4 @@ if PRETEND:
         sys.exit(f"SKYLOOP_PRETEND is {PRETEND!r} and must be one of {', '.join(_MISSING)}")
     sys.meta_path.insert(0, _Finder(PRETEND))
     if PRETEND == "win32":
-        sys.addaudithook(_hold_open_files)
+        _keep_open_files()

@@ -7,6 +7,7 @@ server uses the fast side where it works, unless ``SKYLOOP_TRANSPORT=portable``.
 
 from __future__ import annotations
 
+import errno
 import functools
 import importlib
 import os
@@ -16,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, cast
 
-from skyloop.errors import UsageError
+from skyloop.errors import LinkError, UsageError
 
 if TYPE_CHECKING:
     from skyloop.transport.base import Pixels
@@ -26,6 +27,11 @@ TRANSPORT_VARIABLE: Final = "SKYLOOP_TRANSPORT"
 FAST: Final = "fast"
 PORTABLE: Final = "portable"
 _AUTO: Final = "auto"
+#: What kernels say of calls, sockets and memory that they do not have, or do not allow.
+_LACKING: Final = {
+    *(errno.EINVAL, errno.ENOSYS, errno.EPERM, errno.EACCES, errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT),
+    *(errno.EPROTOTYPE, errno.EOPNOTSUPP),
+}
 PROXY: Final = "proxy"
 HOST: Final = "host"  #: a host for many proxies; its socket accepts requests to add and remove vehicles
 CONNECT_TIMEOUT_S: Final = 1.0
@@ -157,16 +163,30 @@ class System(Protocol):
 
 @functools.cache
 def systems() -> dict[str, System]:
-    """Return the sides that exist on this system, the preferred one first."""
+    """Return the sides that exist on this system, the preferred one first.
+
+    Raises :class:`LinkError` if this can't be determined now, because memory or descriptors have run out. The process
+    must not settle on the portable side for that: it would no longer see the proxies of the fast one.
+    """
     found: dict[str, System] = {}
     for name in (FAST, PORTABLE):
         try:
             side = importlib.import_module(f"skyloop.transport.local.{name}")
             side.check_support()
-        except (ImportError, AttributeError, AssertionError, OSError):
-            continue  # a function that this side needs does not exist
+        except (ImportError, AttributeError, AssertionError, OSError) as error:
+            if not _is_lacking(error):
+                raise LinkError(f"the local transport can't be prepared: {error}") from error
+            continue
         found[name] = cast(System, side)
     return found
+
+
+def _is_lacking(error: Exception) -> bool:
+    """Return whether an error means that the system lacks a function, now and later."""
+    if isinstance(error, OSError):
+        return error.errno in _LACKING
+    # Without descriptors, Python finds none of our own modules.
+    return not (isinstance(error, ImportError) and (error.name or "").startswith("skyloop"))
 
 
 def serving_side() -> str:
