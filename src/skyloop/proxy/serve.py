@@ -265,7 +265,9 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
 
-    interrupts = (signal.SIGINT, *([signal.SIGBREAK] if sys.platform == "win32" else []))
+    interrupts = [signal.SIGINT]
+    if sys.platform == "win32":
+        interrupts.append(signal.SIGBREAK)
     before = {one: signal.signal(one, signal.SIG_IGN if ignore_interrupt else asked) for one in interrupts}
     before[signal.SIGTERM] = signal.signal(signal.SIGTERM, asked)
     try:
