@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -582,6 +583,117 @@ def test_select_does_what_the_other_selectors_do(monkeypatch: pytest.MonkeyPatch
     poller.close()
     poller.wake()
     poller.unregister(1)
+
+
+# --- what ends, and what must not ---
+
+
+def test_a_stopping_proxy_keeps_its_name_until_its_file_is_removed(runtime_dir: Path) -> None:
+    """Otherwise, it could remove the file of the next one, which may get the same inode."""
+    first, second = LocalServer("alpha"), LocalServer("alpha")
+    first.start(ServerLog())
+    remove = first._directory.remove
+    kept: list[bool] = []
+
+    def look_first(*args: Any) -> None:
+        kept.append(portable.is_live(runtime_dir / "alpha.port"))
+        remove(*args)
+
+    first._directory.remove = look_first  # type: ignore[method-assign]
+    first.stop()
+    assert kept == [True]
+    assert list(runtime_dir.glob("*.port")) == []
+    second.start(ServerLog())
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    second.stop()
+
+
+def test_a_proxy_that_could_not_remove_its_file_gives_its_memory_to_nobody(
+    runtime_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process may still run, and use its memory for other proxies."""
+    removed: list[str] = []
+
+    def fail(*_: object, **__: object) -> None:
+        raise LinkError("the directory is locked by another process")
+
+    with serving() as (server, _):
+        monkeypatch.setattr(server._directory, "lock", fail)
+    assert (runtime_dir / "alpha.port").exists()
+    monkeypatch.setattr(portable, "prefix", lambda: "sky-of-another")
+    monkeypatch.setattr(portable, "remove_names", removed.append)
+    assert list_names() == []
+    assert list(runtime_dir.glob("*.port")) == []
+    assert removed == []
+
+
+def gate_of(server: LocalServer) -> portable.Gate:
+    gate = server._listener
+    assert isinstance(gate, portable.Gate)
+    return gate
+
+
+def test_a_stop_waits_for_no_copy_of_its_sockets() -> None:
+    """A forked child may hold one."""
+    with serving() as (server, _):
+        copies = [os.dup(end.fileno()) for end in (gate_of(server)._woken, gate_of(server)._bell)]
+        stop = threading.Thread(target=server.stop, daemon=True)
+        stop.start()
+        stop.join(5.0)
+        stopped = not stop.is_alive()
+        for copy in copies:
+            os.close(copy)
+        assert stopped
+
+
+@only_on("linux", "darwin", reason="no process forks")
+def test_a_fork_keeps_no_copy_of_a_gate() -> None:
+    import warnings
+
+    with serving() as (server, _):
+        gate = gate_of(server)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12
+            child = os.fork()
+        if child == 0:
+            os._exit(any(sock.fileno() >= 0 for sock in (gate._listener, gate._woken, gate._bell)) or gate._lock >= 0)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        dial("alpha")(ClientLog()).close()
+
+
+def test_a_gate_survives_any_failure(runtime_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
+    failures = [RuntimeError("dictionary changed size during iteration"), MemoryError()]
+
+    class Failing(dict[socket.socket, None]):
+        def __setitem__(self, key: socket.socket, value: None) -> None:
+            if failures:
+                raise failures.pop()
+            super().__setitem__(key, value)
+
+    with serving() as (server, log):
+        gate_of(server)._strangers = Failing()
+        for _ in range(2):
+            with socket.create_connection(("127.0.0.1", registration(runtime_dir).port), 5) as sock:
+                assert sock.recv(100) == b"", "it is closed"
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "others are let in")
+        client.close()
+    assert caplog.text.count("cannot accept") == 2
+
+
+def test_a_gate_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    for patched in ((portable.threading.Thread, "start"), (portable.socket, "socketpair")):
+        with monkeypatch.context() as patch:
+            patch.setattr(*patched, fail if patched[1] == "start" else lambda: fail(threading.current_thread()))
+            with pytest.raises(RuntimeError, match="can't start"):
+                LocalServer("alpha").start(ServerLog())
+        assert list(runtime_dir.glob("*.port")) == []
+        assert not [file for file in open_files() if str(runtime_dir) in file and ".port" in file]
+    with serving():
+        pass
 
 
 # --- killed processes ---

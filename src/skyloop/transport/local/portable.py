@@ -358,7 +358,13 @@ def listen(path: Path, gid: int | None) -> Gate:
         listener.bind((_HOST, 0))
         listener.listen(128)
         registration = Registration(listener.getsockname()[1], os.getpid(), os.urandom(32), prefix())
-        return Gate(listener, registration, path, _register(path, registration))
+        lock = _register(path, registration)
+        try:
+            return Gate(listener, registration, path.name, lock)
+        except BaseException:
+            os.close(lock)
+            path.unlink(missing_ok=True)
+            raise
     except BaseException:
         listener.close()
         raise
@@ -491,30 +497,49 @@ def _challenge(sock: socket.socket, registration: Registration, deadline_s: floa
 class Gate:
     """A server's socket. It lets only those in that know the secret, each of which has a thread until then."""
 
-    def __init__(self, listener: socket.socket, registration: Registration, path: Path, lock: int) -> None:
+    _lock = -1
+    _ends: tuple[socket.socket, ...] = ()
+
+    def __init__(self, listener: socket.socket, registration: Registration, name: str, lock: int) -> None:
         listener.settimeout(HANDSHAKE_S)
         self._listener = listener
         self._registration = registration
-        self._path = path
-        self._lock = lock
+        self._name = name
         self._strangers: dict[socket.socket, None] = {}  # oldest first
+        self._meeting = threading.Lock()  # guards those
         self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
-        self._woken, self._bell = socket.socketpair()  # a byte for each of those
+        self._ends = self._woken, self._bell = socket.socketpair()  # a byte for each of those
         self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
         self._bell.setblocking(False)
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="skyloop-gate", daemon=True)
         self._thread.start()
+        self._lock = lock  # its owner from here on
         leave_to_parent(self)
 
     def __del__(self) -> None:
-        self._woken.close()
+        for end in self._ends:
+            end.close()
+        self.release()
 
     def forked(self) -> None:
         """Close a forked child's copies. Otherwise, the registration would stay locked after the parent's end."""
-        self._listener.close()
-        if self._lock >= 0:
-            os.close(self._lock)
+        for copy in (self._listener, *self._ends):
+            copy.close()
+        lock, self._lock = self._lock, -1
+        if lock >= 0:
+            os.close(lock)
+
+    def release(self) -> None:
+        """Empty the registration and unlock it. If it could not be removed, the next listing does that.
+
+        The memory is not that listing's to remove, because other servers of this process may still use it.
+        """
+        lock, self._lock = self._lock, -1
+        if lock >= 0:
+            with suppress(OSError):
+                os.ftruncate(lock, 0)
+            os.close(lock)
 
     def fileno(self) -> int:
         return self._woken.fileno()
@@ -539,33 +564,37 @@ class Gate:
     def _run(self) -> None:
         while not self._closing:
             try:
-                sock, _ = self._listener.accept()
+                self._meet(self._listener.accept()[0])
             except (TimeoutError, ConnectionError):
                 continue
-            except OSError as error:  # descriptors or memory have run out
-                _log.warning("%s cannot accept: %s", self._path.name, error)
+            except Exception as error:  # noqa: BLE001  e.g. no more descriptors, memory or threads; others may come
+                _log.warning("%s cannot accept: %r", self._name, error)
                 time.sleep(_FAILED_S)
-                continue
-            if len(self._strangers) >= MAX_STRANGERS and (oldest := next(iter(self._strangers), None)):
-                self._strangers.pop(oldest, None)
-                with suppress(OSError):  # its thread ends it
-                    oldest.shutdown(socket.SHUT_RDWR)
-                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
-            self._strangers[sock] = None
-            try:
-                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
-            except RuntimeError as error:  # no more threads
-                _log.warning("%s cannot accept: %s", self._path.name, error)
-                self._strangers.pop(sock)
-                sock.close()
         self._listener.close()
-        if sys.platform != "win32":  # a locked file can be removed, so that no one takes it for that of a killed proxy
-            with suppress(OSError):
-                if self._path.lstat().st_ino == os.fstat(self._lock).st_ino:
-                    self._path.unlink()
-        lock, self._lock = self._lock, -1
-        os.close(lock)
-        self._bell.close()
+        with suppress(OSError):  # wakes ``accept``, even if a process holds a copy of this socket
+            self._bell.shutdown(socket.SHUT_RDWR)
+
+    def _meet(self, sock: socket.socket) -> None:
+        """Start to greet a stranger. If there are too many, the oldest gives way."""
+        try:
+            with self._meeting:
+                oldest = next(iter(self._strangers), None) if len(self._strangers) >= MAX_STRANGERS else None
+                if oldest is not None:
+                    del self._strangers[oldest]
+                    with suppress(OSError):  # its thread ends it
+                        oldest.shutdown(socket.SHUT_RDWR)
+                self._strangers[sock] = None
+            if oldest is not None:
+                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
+            threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
+        except BaseException:
+            self._part(sock)
+            sock.close()
+            raise
+
+    def _part(self, sock: socket.socket) -> None:
+        with self._meeting:
+            self._strangers.pop(sock, None)
 
     def _greet(self, sock: socket.socket) -> None:
         found: StreamSocket | str = ""
@@ -578,9 +607,10 @@ class Gate:
             found = f"{_TURNED_AWAY}: it did not prove within {HANDSHAKE_S:g} s that it knows the secret"
         except OSError:
             pass  # it only looked who is there, or gave up
-        self._strangers.pop(sock, None)
-        if isinstance(found, str):
-            sock.close()
+        finally:
+            self._part(sock)
+            if isinstance(found, str):
+                sock.close()
         if found:
             self._pass_on(found)
 

@@ -250,11 +250,11 @@ class SharedLocalServer(LocalServer):
         self._listening = Source(self, sock=listener)
         self.reactor.add(self._listening)
 
-    def _finish(self, listener: Listener) -> None:  # noqa: ARG002  (the source owns it)
+    def _finish(self, listener: Listener) -> None:
         source, self._listening = self._listening, None
         if source is not None:
             self._drop(source)
-        self._directory.remove(self._name, self._inode)
+        self._directory.remove(self._name, self._inode, listener)
         for connection in list(self._connections):
             connection.hang_up("the proxy stopped")
         # A handler that stops its own server must not wait for itself.

@@ -243,7 +243,7 @@ class LocalServer(TransportServer):
                 if thread is not None:
                     threads = [thread, *(other for other in threads if other.is_alive())]
         finally:
-            self._directory.remove(self._name, inode)
+            self._directory.remove(self._name, inode, listener)
             for connection in list(self._connections):
                 connection.hang_up("the proxy stopped")
             for thread in threads:
