@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import errno
 import hashlib
 import hmac
 import itertools
@@ -395,9 +396,11 @@ def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> No
     assert here._rest, "the last one was sent in part"
     room = threading.Event()
     here.on_room(room.set)
+    here.send(b"next", here.post_flags)
     with pytest.raises(BlockingIOError):
         here.send(b"another", here.post_flags)
     assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
+    assert there.recv(MAX_PACKET) == b"next"
     with pytest.raises(BlockingIOError):
         there.recv(MAX_PACKET, 1)
     assert room.wait(5.0)
@@ -436,6 +439,7 @@ def test_a_packet_can_wait_for_room(pair: Pair) -> None:
     here, there, _ = pair
     while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
         pass
+    here.send(b"next")
     assert is_refused(lambda: here.send_within(b"late", 0.02))
     reader = threading.Timer(0.05, lambda: [there.recv(MAX_PACKET) for _ in range(2)])
     reader.start()
@@ -694,6 +698,156 @@ def test_a_gate_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypat
         assert not [file for file in open_files() if str(runtime_dir) in file and ".port" in file]
     with serving():
         pass
+
+
+# --- accepted packets, and the boundary between them ---
+
+
+def fill(here: StreamSocket) -> int:
+    """Send the longest packets until the last one is sent in part; return how many were accepted."""
+    for number in range(100):
+        if is_refused(lambda: here.send(number.to_bytes(MAX_PACKET, "little"))):  # noqa: B023
+            assert here._rest
+            return number
+    raise AssertionError("the backlog is not bounded")
+
+
+def test_what_was_accepted_arrives_although_its_sender_hung_up(pair: Pair) -> None:
+    here, there, _ = pair
+    sent = fill(here)
+    began = time.monotonic()
+    here.hang_up(b"bye")
+    assert time.monotonic() - began < 0.2
+    with pytest.raises(OSError, match="has ended"):
+        here.send(b"more")
+    assert here.recv(100) == b""
+    for number in range(sent):
+        assert there.recv(MAX_PACKET) == number.to_bytes(MAX_PACKET, "little")
+    assert there.recv(100) == b"bye"
+    assert there.recv(100) == b""
+
+
+def test_a_stalled_reader_does_not_keep_a_connection_that_hung_up(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portable, "_REST_S", 0.05, raising=False)
+    here, there, _ = pair
+    sent = fill(here)
+    here.hang_up()
+    wait_until(lambda: not here._awaiting_room, "its thread has ended")
+    assert [len(there.recv(MAX_PACKET)) for _ in range(sent - 1)] == [MAX_PACKET] * (sent - 1)
+    assert there.recv(100) == b"", "the rest is missing"
+
+
+class CutShort:
+    """A socket behind whose calls a signal's handler raises an exception."""
+
+    def __init__(self, sock: socket.socket, most: int) -> None:
+        self._sock, self._most = sock, most
+
+    def send(self, content: bytes) -> int:
+        self._sock.send(content[: self._most])
+        raise KeyboardInterrupt
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        content = self._sock.recv(min(size, self._most), flags)
+        if flags & socket.MSG_PEEK:
+            return content
+        raise KeyboardInterrupt
+
+    def shutdown(self, how: int) -> None:
+        self._sock.shutdown(how)
+
+
+def test_an_exception_in_the_middle_of_sending_ends_the_connection(pair: Pair) -> None:
+    here, there, raw = pair
+    here.send(b"before")
+    here._socket = CutShort(raw, 10)  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        here.send(b"a" * 20)
+    here._socket = raw  # type: ignore[assignment]
+    with pytest.raises(OSError):  # noqa: PT011
+        here.send(b"stop")
+    assert there.recv(100) == b"before"
+    assert there.recv(100) == b""
+
+
+def test_an_exception_in_the_middle_of_receiving_ends_the_connection(pair: Pair) -> None:
+    here, there, _ = pair
+    here.send(b"a" * 20)
+    here.send(b"next")
+    raw = there._socket
+    there._socket = CutShort(raw, 10)  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        there.recv(100)
+    there._socket = raw
+    assert there.recv(100) == b""
+    wait_until(lambda: not is_refused(lambda: here.recv(100, 1)), "the other end learns it")
+
+
+def test_an_exception_before_the_rests_thread_starts_ends_the_connection(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_thread, "start_new_thread", interrupt)
+    here, _, _ = pair
+    with pytest.raises(KeyboardInterrupt):
+        fill(here)
+    here.hang_up()
+    assert here.recv(100) == b""
+
+
+def test_an_end_stays_although_a_packet_arrived_meanwhile(pair: Pair) -> None:
+    here, there, raw = pair
+
+    class HungUp(CutShort):
+        def recv(self, size: int, flags: int = 0) -> bytes:
+            there.hang_up()
+            return raw.recv(size, flags)
+
+    here.send(b"packet")
+    raw, there._socket = there._socket, HungUp(raw, 0)  # type: ignore[assignment]
+    there.recv(100)
+    assert there._ended
+    there._socket = raw
+
+
+def test_a_rest_that_can_not_be_sent_is_forgotten_with_its_connection(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failing(CutShort):
+        def send(self, content: bytes) -> int:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
+
+        def fileno(self) -> int:
+            return readable.fileno()
+
+    monkeypatch.setattr(_thread, "start_new_thread", lambda *_: None)
+    here, _, raw = pair
+    fill(here)
+    readable, other = socket.socketpair()  # there is room
+    with readable, other:
+        here._socket = Failing(raw, 0)  # type: ignore[assignment]
+        here._complete()
+        here._socket = raw  # type: ignore[assignment]
+    assert here._rest == b""
+    assert here.recv(100) == b""
+    with pytest.raises(OSError):  # noqa: PT011
+        here.send(b"mixed")
+
+
+def test_one_small_packet_follows_a_rest(pair: Pair) -> None:
+    """A stop is not refused because a large packet is on its way."""
+    here, there, _ = pair
+    sent = fill(here)
+    assert is_refused(lambda: here.send(bytes(1025)))
+    here.send(b"stop" * 256, SEND_FLAGS)
+    assert is_refused(lambda: here.send(b"second"))
+    assert [len(there.recv(MAX_PACKET)) for _ in range(sent)] == [MAX_PACKET] * sent
+    assert there.recv(2000) == b"stop" * 256
+    wait_until(lambda: not here._rest, "it knows")
+    here.send(b"third")
+    assert there.recv(100) == b"third"
 
 
 # --- killed processes ---

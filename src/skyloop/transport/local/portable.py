@@ -6,7 +6,8 @@ users of the host, and programs that took over the port of an ended server, lear
 its registration. The lock ends with the process and shows whether it still runs.
 
 Each packet follows its length in four bytes. If the kernel takes only a part of a packet, a thread sends the rest when
-there is room, and further packets are refused until then. The server is then told, so that it sends the newest frame.
+there is room, also after the sender has hung up. Until then, one small packet may follow it, such as a stop, and
+further ones are refused. The server is then told, so that it sends the newest frame.
 """
 
 from __future__ import annotations
@@ -60,6 +61,9 @@ _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
 _LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
+_REST_S: Final = 1.0  # time for the rest of a packet after its sender has hung up
+_REST_SLICE_MS: Final = 250  # how often its thread looks whether it has
+_SMALL: Final = 1024  # longest packet that may follow a rest
 _MOST_WAITING: Final = 128
 _FAILED_S: Final = 0.2  # pause after a failure to accept, when descriptors or memory have run out
 _REGISTRATION: Final = struct.Struct("<8sHHI32s32s")  # magic, version, port, process, secret, names of its memory
@@ -117,7 +121,8 @@ class StreamSocket:
         # Re-entrant, because the garbage collector or a signal's handler may send in the middle of another call.
         self._sending = threading.RLock()
         self._inside = False  # whether a call that sends is under way
-        self._rest = b""  # the unsent end of a packet that was sent in part
+        self._rest = b""  # the unsent end of a packet that was sent in part, and a small one behind it
+        self._followed = False  # whether there is one
         self._awaiting_room = False  # whether a thread waits until something fits again
         self._has_room: Callable[[], object] | None = None
         self._partial = bytearray()  # the beginning of an incomplete packet, with its length
@@ -136,25 +141,50 @@ class StreamSocket:
         return len(packet)
 
     def _send(self, packet: bytes) -> None:
+        if self._ended:
+            raise BrokenPipeError(errno.EPIPE, "the connection has ended")
         if self._inside:
             raise BlockingIOError(errno.EAGAIN, "this thread is sending")
         self._inside = True
         try:
-            self._send_rest()
-            content = len(packet).to_bytes(_LENGTH, "little") + packet
-            self._rest = content[self._socket.send(content) :]
-        except BlockingIOError:
-            self._await_room()
-            raise
-        else:
-            if self._rest:
+            accepted = self._offer(len(packet).to_bytes(_LENGTH, "little") + packet)
+            if self._rest or not accepted:
                 self._await_room()
+        except OSError:
+            raise
+        except BaseException:  # raised by a signal's handler: it is unknown how much the kernel took
+            self._break()
+            raise
         finally:
             self._inside = False
+        if not accepted:
+            raise BlockingIOError(errno.EAGAIN, "it does not fit now")
+
+    def _offer(self, content: bytes) -> bool:
+        """Send a packet with its length, at least in part; return False if it is refused."""
+        try:
+            if self._rest:
+                self._send_rest()
+            self._rest = content[self._socket.send(content) :]
+        except BlockingIOError:
+            if not self._rest or self._followed or len(content) > _LENGTH + _SMALL:
+                return False
+            self._rest, self._followed = self._rest + content, True
+        return True
 
     def _send_rest(self) -> None:
         while self._rest:
             self._rest = self._rest[self._socket.send(self._rest) :]
+        self._followed = False
+
+    def _break(self) -> None:
+        """End the connection at once, because the boundary between packets is lost."""
+        self._ended, self._rest = True, b""
+        self._shut_down(socket.SHUT_RDWR)
+
+    def _shut_down(self, how: int) -> None:
+        with suppress(OSError):  # the connection had already ended
+            self._socket.shutdown(how)
 
     def _await_room(self) -> None:
         if not self._awaiting_room:
@@ -162,20 +192,39 @@ class StreamSocket:
             try:
                 _thread.start_new_thread(self._complete, ())
             except RuntimeError as error:  # no more threads
-                self.hang_up()
+                self._break()
                 raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
 
     def _complete(self) -> None:
-        """Send the rest of a packet as soon as there is room, and tell the server so."""
-        with suppress(OSError, ValueError):  # the connection has ended, or was closed
-            wait = _waiter(self._socket, to_send=True)
-            while self._awaiting_room and not self._ended:
-                wait(_SLICE_MS)
-                with self._sending, suppress(BlockingIOError):
+        """Send the rest of a packet as soon as there is room, and tell the server so, or end the connection."""
+        try:
+            self._wait_and_send()
+        except BaseException as error:
+            self._break()
+            if not isinstance(error, (OSError, ValueError)):  # the connection has ended, or was closed
+                raise
+        self._awaiting_room = False
+        if self._ended:
+            self._shut_down(socket.SHUT_RDWR)
+        elif (has_room := self._has_room) is not None:
+            with suppress(OSError, ValueError):
+                has_room()
+
+    def _wait_and_send(self) -> None:
+        wait, deadline_s = _waiter(self._socket, to_send=True), math.inf
+        while self._awaiting_room and time.monotonic() < deadline_s:
+            wait(_REST_SLICE_MS)
+            with self._sending:
+                self._inside = True
+                try:
                     self._send_rest()
                     self._awaiting_room = False
-            if (has_room := self._has_room) is not None:
-                has_room()
+                except BlockingIOError:
+                    pass
+                finally:
+                    self._inside = False
+            if self._ended:
+                deadline_s = min(deadline_s, time.monotonic() + _REST_S)
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
         raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
@@ -205,8 +254,14 @@ class StreamSocket:
                     raise
                 self._wait()
                 continue
-            self._ended = not packet
-            return packet
+            except OSError:
+                raise
+            except BaseException:  # raised by a signal's handler: it is unknown how much was taken from the kernel
+                self._break()
+                raise
+            if packet:
+                return packet
+            break
         self._ended = True
         return b""
 
@@ -226,9 +281,7 @@ class StreamSocket:
     def _next(self, size: int) -> bytes:
         """Return the next packet; empty at the end. ``BlockingIOError``: it has not arrived completely."""
         receive, partial = self._socket.recv, self._partial
-        # In the usual case, one call takes a whole packet. If a signal's handler raises an exception behind that call,
-        # a packet is lost, as with any socket, but not the boundary between packets.
-        if not partial:
+        if not partial:  # in the usual case, one call takes a whole packet
             head = receive(_LENGTH, socket.MSG_PEEK)
             if not head:
                 return b""
@@ -276,8 +329,10 @@ class StreamSocket:
                 self.send(last_packet, SEND_FLAGS)
         self._ended = True
         self._has_room = None
-        with suppress(OSError):  # the connection had already ended
-            self._socket.shutdown(socket.SHUT_RDWR)
+        if not (self._rest and self._awaiting_room):
+            self._shut_down(socket.SHUT_RDWR)
+        elif sys.platform != "win32":  # its thread does the rest; Windows would reset the connection
+            self._shut_down(socket.SHUT_RD)
 
     def close(self) -> None:
         self._socket.close()
