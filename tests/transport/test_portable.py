@@ -30,6 +30,8 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
 from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
 from skyloop.transport.local.portable import Registration, StreamSocket
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
+from skyloop.transport.local.server import ServerConnection
 from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 from tests.support.systems import PLATFORM, only_on
@@ -698,6 +700,42 @@ def test_a_gate_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypat
         assert not [file for file in open_files() if str(runtime_dir) in file and ".port" in file]
     with serving():
         pass
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_connection_that_fails_early_ends_alone(shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """macOS refuses to set options of a connection that has been reset."""
+    failures = [OSError(errno.EINVAL, "Invalid argument")]
+    ready = ServerConnection.__init__
+
+    def fail_once(*args: Any) -> None:
+        if failures:
+            raise failures.pop()
+        ready(*args)
+
+    monkeypatch.setattr(ServerConnection, "__init__", fail_once)
+    reactor = Reactor() if shared else None
+    server, log, heard = (
+        SharedLocalServer("alpha", reactor) if reactor else LocalServer("alpha"),
+        ServerLog(),
+        ClientLog(),
+    )
+    server.start(log)
+    failing = dial("alpha")(heard)
+    wait_until(lambda: heard.closings, "it is ended")
+    client = dial("alpha")(ClientLog())
+    wait_until(lambda: log.joined, "others are let in")
+    client.close()
+    failing.close()
+    server.stop()
+    if reactor:
+        reactor.close()
+
+
+def test_a_reset_connection_can_be_limited(pair: Pair) -> None:
+    here, _, _ = pair
+    here.close()
+    here.limit_backlog()
 
 
 # --- accepted packets, and the boundary between them ---

@@ -321,7 +321,8 @@ class StreamSocket:
         self._has_room = call
 
     def limit_backlog(self) -> None:
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
+        with suppress(OSError):  # it has been reset, which macOS reports here
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         if last_packet:

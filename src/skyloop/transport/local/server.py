@@ -287,7 +287,15 @@ class LocalServer(TransportServer):
                 _log.exception("the handler of %s failed in refused()", self.address)
 
     def _let_in(self, sock: PacketSocket) -> ServerConnection | None:
-        """Return the caller's connection; None if the caller may not connect or there is no room."""
+        """Return the caller's connection; None if it failed, the caller may not connect, or there is no room."""
+        try:
+            return self._examine(sock)
+        except Exception as error:  # noqa: BLE001  it must end only this connection
+            _log.warning("%s could not let a connection in: %r", self.address, error)
+            sock.hang_up()
+            return None
+
+    def _examine(self, sock: PacketSocket) -> ServerConnection | None:
         who = sock.who
         if not self._system.may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
