@@ -738,6 +738,54 @@ def test_a_reset_connection_can_be_limited(pair: Pair) -> None:
     here.limit_backlog()
 
 
+def test_connections_beyond_what_select_takes_end_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What Windows has."""
+    monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
+    monkeypatch.setattr(portable, "_MOST_SELECTED", 3, raising=False)  # its bell, a server, and a client
+    reactor = Reactor()
+    server, log = SharedLocalServer("alpha", reactor), ServerLog()
+    server.start(log)
+    heard = ClientLog()
+    first, second = dial("alpha")(ClientLog()), dial("alpha")(heard)
+    wait_until(lambda: heard.closings, "the second is ended")
+    assert "too many" in heard.closings[0]
+    assert len(log.joined) == 1
+    full = SharedLocalServer("bravo", reactor)
+    with pytest.raises(OSError, match="too many"):
+        full.start(ServerLog())
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    assert first.send(b"packet")
+    wait_until(lambda: log.packets, "the first is served")
+    first.close()
+    wait_until(lambda: log.left, "it left")
+    third = dial("alpha")(ClientLog())
+    wait_until(lambda: len(log.joined) == 2, "its place is free")
+    third.close()
+    second.close()
+    server.stop()
+    reactor.close()
+
+
+def test_a_wait_that_fails_does_not_end_the_receiving_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    failures: list[Exception] = [ValueError("too many file descriptors in select()")]
+    poll = portable.SelectorPoller.poll
+
+    def fail_once(poller: portable.SelectorPoller, timeout_s: float) -> list[tuple[int, int]]:
+        if failures:
+            raise failures.pop()
+        return poll(poller, timeout_s)
+
+    monkeypatch.setattr(portable.SelectorPoller, "poll", fail_once)
+    reactor = Reactor()
+    server, log = SharedLocalServer("alpha", reactor), ServerLog()
+    server.start(log)
+    client = dial("alpha")(ClientLog())
+    wait_until(lambda: log.joined, "it joined")
+    client.close()
+    server.stop()
+    reactor.close()
+
+
 # --- accepted packets, and the boundary between them ---
 
 

@@ -65,6 +65,7 @@ _REST_S: Final = 1.0  # time for the rest of a packet after its sender has hung 
 _REST_SLICE_MS: Final = 250  # how often its thread looks whether it has
 _SMALL: Final = 1024  # longest packet that may follow a rest
 _MOST_WAITING: Final = 128
+_MOST_SELECTED: Final = 512  # what Windows' select waits for
 _FAILED_S: Final = 0.2  # pause after a failure to accept, when descriptors or memory have run out
 _REGISTRATION: Final = struct.Struct("<8sHHI32s32s")  # magic, version, port, process, secret, names of its memory
 _MAGIC: Final = b"SkyPort\n"
@@ -367,6 +368,8 @@ class SelectorPoller:
             return []
 
     def register(self, fileno: int) -> None:
+        if isinstance(self._selector, selectors.SelectSelector) and len(self._selector.get_map()) >= _MOST_SELECTED:
+            raise OSError(errno.EMFILE, "too many sockets for this system")
         with suppress(KeyError):
             self._selector.register(fileno, selectors.EVENT_READ)
         self.wake()  # not every selector notices it otherwise

@@ -156,7 +156,13 @@ class LocalServer(TransportServer):
             listener, inode = self._directory.listen(self._name)
             self._started = True
             self._listener = listener
-            self._begin(handler, listener, inode)
+            try:
+                self._begin(handler, listener, inode)
+            except BaseException:
+                self._listener = None
+                listener.hang_up()
+                self._directory.remove(self._name, inode, listener)
+                raise
 
     def _begin(self, handler: ServerHandler, listener: Listener, inode: int) -> None:
         """Start accepting and receiving."""
