@@ -155,6 +155,21 @@ def test_silent_strangers_keep_no_one_out(runtime_dir: Path, monkeypatch: pytest
             sock.close()
 
 
+def test_an_evicted_client_learns_that_it_may_try_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def give_way(sock: socket.socket, *_: object) -> int:
+        sock.sendall(bytes(32))
+        sock.recv(1000)
+        sock.shutdown(socket.SHUT_RDWR)
+        raise ConnectionAbortedError
+
+    with serving():
+        with monkeypatch.context() as patch:
+            patch.setattr(portable, "_challenge", give_way)
+            with pytest.raises(LinkError, match="perhaps too many others are connecting, so try again"):
+                dial("alpha")(ClientLog())
+        dial("alpha")(ClientLog()).close()
+
+
 def test_the_server_listens_on_the_loopback_interface_only(runtime_dir: Path) -> None:
     with serving():
         listening = Path("/proc/net/tcp").read_text() + Path("/proc/net/tcp6").read_text()

@@ -90,6 +90,7 @@ class Registration(NamedTuple):
         return hmac.digest(self.secret, said, hashlib.sha256)
 
 
+_NOT_LET_IN: Final = "it closed the connection too early; perhaps too many others are connecting, so try again"
 _TURNED_AWAY: Final = "a process that wanted to connect was turned away"
 _CLIENT: Final = b"skyloop client"
 _SERVER: Final = b"skyloop server"
@@ -534,7 +535,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
     while len(content) < size:
         sock.settimeout(max(1e-3, deadline_s - time.monotonic()))
         if not (more := sock.recv(size - len(content))):
-            raise ConnectionAbortedError(errno.ECONNABORTED, "it turned this process away")
+            raise ConnectionAbortedError(errno.ECONNABORTED, _NOT_LET_IN)
         content += more
     return content
 
