@@ -547,7 +547,7 @@ def test_a_send_within_a_send_is_refused(pair: Pair) -> None:
 
     here._socket = Interrupted()  # type: ignore[assignment]
     here.send(b"outside")
-    here._socket = raw  # type: ignore[assignment]
+    here._socket = raw
     assert there.recv(100) == b"outside"
     with here._sending:
         refused: list[bool] = []
@@ -620,7 +620,7 @@ def test_a_stopping_proxy_keeps_its_name_until_its_file_is_removed(runtime_dir: 
         kept.append(portable.is_live(runtime_dir / "alpha.port"))
         remove(*args)
 
-    first._directory.remove = look_first  # type: ignore[method-assign]
+    first._directory.remove = look_first  # type: ignore[method-assign,assignment]
     first.stop()
     assert kept == [True]
     assert list(runtime_dir.glob("*.port")) == []
@@ -703,12 +703,12 @@ def test_a_gate_survives_any_failure(runtime_dir: Path, caplog: pytest.LogCaptur
 
 
 def test_a_gate_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_: threading.Thread) -> None:
+    def fail(*_: object) -> None:
         raise RuntimeError("can't start new thread")
 
-    for patched in ((portable.threading.Thread, "start"), (portable.socket, "socketpair")):
+    for patched in ("threading.Thread.start", "socket.socketpair"):
         with monkeypatch.context() as patch:
-            patch.setattr(*patched, fail if patched[1] == "start" else lambda: fail(threading.current_thread()))
+            patch.setattr(patched, fail)
             with pytest.raises(RuntimeError, match="can't start"):
                 LocalServer("alpha").start(ServerLog())
         assert list(runtime_dir.glob("*.port")) == []
@@ -864,7 +864,7 @@ def test_an_exception_in_the_middle_of_sending_ends_the_connection(pair: Pair) -
     here._socket = CutShort(raw, 10)  # type: ignore[assignment]
     with pytest.raises(KeyboardInterrupt):
         here.send(b"a" * 20)
-    here._socket = raw  # type: ignore[assignment]
+    here._socket = raw
     with pytest.raises(OSError):  # noqa: PT011
         here.send(b"stop")
     assert there.recv(100) == b"before"
@@ -930,7 +930,7 @@ def test_a_rest_that_can_not_be_sent_is_forgotten_with_its_connection(
     with readable, other:
         here._socket = Failing(raw, 0)  # type: ignore[assignment]
         here._complete()
-        here._socket = raw  # type: ignore[assignment]
+        here._socket = raw
     assert here._rest == b""
     assert here.recv(100) == b""
     with pytest.raises(OSError):  # noqa: PT011
