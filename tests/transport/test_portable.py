@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -29,6 +30,8 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.transport.base import MAX_PACKET, NOBODY, video
 from skyloop.transport.local import LocalServer, dial, list_names, named_memory, packets, portable
 from skyloop.transport.local.portable import Registration, StreamSocket
+from skyloop.transport.local.reactor import Reactor, SharedLocalServer
+from skyloop.transport.local.server import ServerConnection
 from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System, systems
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 from tests.support.systems import PLATFORM, only_on
@@ -150,6 +153,21 @@ def test_silent_strangers_keep_no_one_out(runtime_dir: Path, monkeypatch: pytest
         assert [reason.rpartition(": ")[2] for _, reason in log.refusals] == ["others wanted to connect"] * 3
         for sock in silent:
             sock.close()
+
+
+def test_an_evicted_client_learns_that_it_may_try_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def give_way(sock: socket.socket, *_: object) -> int:
+        sock.sendall(bytes(32))
+        sock.recv(1000)
+        sock.shutdown(socket.SHUT_RDWR)
+        raise ConnectionAbortedError
+
+    with serving():
+        with monkeypatch.context() as patch:
+            patch.setattr(portable, "_challenge", give_way)
+            with pytest.raises(LinkError, match="perhaps too many others are connecting, so try again"):
+                dial("alpha")(ClientLog())
+        dial("alpha")(ClientLog()).close()
 
 
 def test_the_server_listens_on_the_loopback_interface_only(runtime_dir: Path) -> None:
@@ -395,9 +413,11 @@ def test_a_packet_sent_in_part_is_completed_without_its_sender(pair: Pair) -> No
     assert here._rest, "the last one was sent in part"
     room = threading.Event()
     here.on_room(room.set)
+    here.send(b"next", here.post_flags)
     with pytest.raises(BlockingIOError):
         here.send(b"another", here.post_flags)
     assert [there.recv(MAX_PACKET) == packet for _ in range(sent)] == [True] * sent
+    assert there.recv(MAX_PACKET) == b"next"
     with pytest.raises(BlockingIOError):
         there.recv(MAX_PACKET, 1)
     assert room.wait(5.0)
@@ -436,6 +456,7 @@ def test_a_packet_can_wait_for_room(pair: Pair) -> None:
     here, there, _ = pair
     while not is_refused(lambda: here.send(bytes(MAX_PACKET))):
         pass
+    here.send(b"next")
     assert is_refused(lambda: here.send_within(b"late", 0.02))
     reader = threading.Timer(0.05, lambda: [there.recv(MAX_PACKET) for _ in range(2)])
     reader.start()
@@ -583,6 +604,351 @@ def test_select_does_what_the_other_selectors_do(monkeypatch: pytest.MonkeyPatch
     poller.close()
     poller.wake()
     poller.unregister(1)
+
+
+# --- what ends, and what must not ---
+
+
+def test_a_stopping_proxy_keeps_its_name_until_its_file_is_removed(runtime_dir: Path) -> None:
+    """Otherwise, it could remove the file of the next one, which may get the same inode."""
+    first, second = LocalServer("alpha"), LocalServer("alpha")
+    first.start(ServerLog())
+    remove = first._directory.remove
+    kept: list[bool] = []
+
+    def look_first(*args: Any) -> None:
+        kept.append(portable.is_live(runtime_dir / "alpha.port"))
+        remove(*args)
+
+    first._directory.remove = look_first  # type: ignore[method-assign,assignment]
+    first.stop()
+    assert kept == [True]
+    assert list(runtime_dir.glob("*.port")) == []
+    second.start(ServerLog())
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    second.stop()
+
+
+def test_a_proxy_that_could_not_remove_its_file_gives_its_memory_to_nobody(
+    runtime_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its process may still run, and use its memory for other proxies."""
+    removed: list[str] = []
+
+    def fail(*_: object, **__: object) -> None:
+        raise LinkError("the directory is locked by another process")
+
+    with serving() as (server, _):
+        monkeypatch.setattr(server._directory, "lock", fail)
+    assert (runtime_dir / "alpha.port").exists()
+    monkeypatch.setattr(portable, "prefix", lambda: "sky-of-another")
+    monkeypatch.setattr(portable, "remove_names", removed.append)
+    assert list_names() == []
+    assert list(runtime_dir.glob("*.port")) == []
+    assert removed == []
+
+
+def gate_of(server: LocalServer) -> portable.Gate:
+    gate = server._listener
+    assert isinstance(gate, portable.Gate)
+    return gate
+
+
+def test_a_stop_waits_for_no_copy_of_its_sockets() -> None:
+    """A forked child may hold one."""
+    with serving() as (server, _):
+        copies = [os.dup(end.fileno()) for end in (gate_of(server)._woken, gate_of(server)._bell)]
+        stop = threading.Thread(target=server.stop, daemon=True)
+        stop.start()
+        stop.join(5.0)
+        stopped = not stop.is_alive()
+        for copy in copies:
+            os.close(copy)
+        assert stopped
+
+
+@only_on("linux", "darwin", reason="no process forks")
+def test_a_fork_keeps_no_copy_of_a_gate() -> None:
+    import warnings
+
+    with serving() as (server, _):
+        gate = gate_of(server)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12
+            child = os.fork()
+        if child == 0:
+            os._exit(any(sock.fileno() >= 0 for sock in (gate._listener, gate._woken, gate._bell)) or gate._lock >= 0)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        dial("alpha")(ClientLog()).close()
+
+
+def test_a_gate_survives_any_failure(runtime_dir: Path, caplog: pytest.LogCaptureFixture) -> None:
+    failures = [RuntimeError("dictionary changed size during iteration"), MemoryError()]
+
+    class Failing(dict[socket.socket, None]):
+        def __setitem__(self, key: socket.socket, value: None) -> None:
+            if failures:
+                raise failures.pop()
+            super().__setitem__(key, value)
+
+    with serving() as (server, log):
+        gate_of(server)._strangers = Failing()
+        for _ in range(2):
+            with socket.create_connection(("127.0.0.1", registration(runtime_dir).port), 5) as sock:
+                assert sock.recv(100) == b"", "it is closed"
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "others are let in")
+        client.close()
+    assert caplog.text.count("cannot accept") == 2
+
+
+def test_a_gate_that_can_not_be_made_leaves_nothing(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    for patched in ("threading.Thread.start", "socket.socketpair"):
+        with monkeypatch.context() as patch:
+            patch.setattr(patched, fail)
+            with pytest.raises(RuntimeError, match="can't start"):
+                LocalServer("alpha").start(ServerLog())
+        assert list(runtime_dir.glob("*.port")) == []
+        assert not [file for file in open_files() if str(runtime_dir) in file and ".port" in file]
+    with serving():
+        pass
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_connection_that_fails_early_ends_alone(shared: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """macOS refuses to set options of a connection that has been reset."""
+    failures = [OSError(errno.EINVAL, "Invalid argument")]
+    ready = ServerConnection.__init__
+
+    def fail_once(*args: Any) -> None:
+        if failures:
+            raise failures.pop()
+        ready(*args)
+
+    monkeypatch.setattr(ServerConnection, "__init__", fail_once)
+    reactor = Reactor() if shared else None
+    server, log, heard = (
+        SharedLocalServer("alpha", reactor) if reactor else LocalServer("alpha"),
+        ServerLog(),
+        ClientLog(),
+    )
+    server.start(log)
+    failing = dial("alpha")(heard)
+    wait_until(lambda: heard.closings, "it is ended")
+    client = dial("alpha")(ClientLog())
+    wait_until(lambda: log.joined, "others are let in")
+    client.close()
+    failing.close()
+    server.stop()
+    if reactor:
+        reactor.close()
+
+
+def test_a_reset_connection_can_be_limited(pair: Pair) -> None:
+    here, _, _ = pair
+    here.close()
+    here.limit_backlog()
+
+
+def test_connections_beyond_what_select_takes_end_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What Windows has."""
+    monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
+    monkeypatch.setattr(portable, "_MOST_SELECTED", 3, raising=False)  # its bell, a server, and a client
+    reactor = Reactor()
+    server, log = SharedLocalServer("alpha", reactor), ServerLog()
+    server.start(log)
+    heard = ClientLog()
+    first, second = dial("alpha")(ClientLog()), dial("alpha")(heard)
+    wait_until(lambda: heard.closings, "the second is ended")
+    assert "too many" in heard.closings[0]
+    assert len(log.joined) == 1
+    full = SharedLocalServer("bravo", reactor)
+    with pytest.raises(OSError, match="too many"):
+        full.start(ServerLog())
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    assert first.send(b"packet")
+    wait_until(lambda: log.packets, "the first is served")
+    first.close()
+    wait_until(lambda: log.left, "it left")
+    third = dial("alpha")(ClientLog())
+    wait_until(lambda: len(log.joined) == 2, "its place is free")
+    third.close()
+    second.close()
+    server.stop()
+    reactor.close()
+
+
+def test_a_wait_that_fails_does_not_end_the_receiving_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    failures: list[Exception] = [ValueError("too many file descriptors in select()")]
+    poll = portable.SelectorPoller.poll
+
+    def fail_once(poller: portable.SelectorPoller, timeout_s: float) -> list[tuple[int, int]]:
+        if failures:
+            raise failures.pop()
+        return poll(poller, timeout_s)
+
+    monkeypatch.setattr(portable.SelectorPoller, "poll", fail_once)
+    reactor = Reactor()
+    server, log = SharedLocalServer("alpha", reactor), ServerLog()
+    server.start(log)
+    client = dial("alpha")(ClientLog())
+    wait_until(lambda: log.joined, "it joined")
+    client.close()
+    server.stop()
+    reactor.close()
+
+
+# --- accepted packets, and the boundary between them ---
+
+
+def fill(here: StreamSocket) -> int:
+    """Send the longest packets until the last one is sent in part; return how many were accepted."""
+    for number in range(100):
+        if is_refused(lambda: here.send(number.to_bytes(MAX_PACKET, "little"))):  # noqa: B023
+            assert here._rest
+            return number
+    raise AssertionError("the backlog is not bounded")
+
+
+def test_what_was_accepted_arrives_although_its_sender_hung_up(pair: Pair) -> None:
+    here, there, _ = pair
+    sent = fill(here)
+    began = time.monotonic()
+    here.hang_up(b"bye")
+    assert time.monotonic() - began < 0.2
+    with pytest.raises(OSError, match="has ended"):
+        here.send(b"more")
+    assert here.recv(100) == b""
+    for number in range(sent):
+        assert there.recv(MAX_PACKET) == number.to_bytes(MAX_PACKET, "little")
+    assert there.recv(100) == b"bye"
+    assert there.recv(100) == b""
+
+
+def test_a_stalled_reader_does_not_keep_a_connection_that_hung_up(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(portable, "_REST_S", 0.05, raising=False)
+    here, there, _ = pair
+    sent = fill(here)
+    here.hang_up()
+    wait_until(lambda: not here._awaiting_room, "its thread has ended")
+    assert [len(there.recv(MAX_PACKET)) for _ in range(sent - 1)] == [MAX_PACKET] * (sent - 1)
+    assert there.recv(100) == b"", "the rest is missing"
+
+
+class CutShort:
+    """A socket behind whose calls a signal's handler raises an exception."""
+
+    def __init__(self, sock: socket.socket, most: int) -> None:
+        self._sock, self._most = sock, most
+
+    def send(self, content: bytes) -> int:
+        self._sock.send(content[: self._most])
+        raise KeyboardInterrupt
+
+    def recv(self, size: int, flags: int = 0) -> bytes:
+        content = self._sock.recv(min(size, self._most), flags)
+        if flags & socket.MSG_PEEK:
+            return content
+        raise KeyboardInterrupt
+
+    def shutdown(self, how: int) -> None:
+        self._sock.shutdown(how)
+
+
+def test_an_exception_in_the_middle_of_sending_ends_the_connection(pair: Pair) -> None:
+    here, there, raw = pair
+    here.send(b"before")
+    here._socket = CutShort(raw, 10)  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        here.send(b"a" * 20)
+    here._socket = raw
+    with pytest.raises(OSError):  # noqa: PT011
+        here.send(b"stop")
+    assert there.recv(100) == b"before"
+    assert there.recv(100) == b""
+
+
+def test_an_exception_in_the_middle_of_receiving_ends_the_connection(pair: Pair) -> None:
+    here, there, _ = pair
+    here.send(b"a" * 20)
+    here.send(b"next")
+    raw = there._socket
+    there._socket = CutShort(raw, 10)  # type: ignore[assignment]
+    with pytest.raises(KeyboardInterrupt):
+        there.recv(100)
+    there._socket = raw
+    assert there.recv(100) == b""
+    wait_until(lambda: not is_refused(lambda: here.recv(100, 1)), "the other end learns it")
+
+
+def test_an_exception_before_the_rests_thread_starts_ends_the_connection(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_thread, "start_new_thread", interrupt)
+    here, _, _ = pair
+    with pytest.raises(KeyboardInterrupt):
+        fill(here)
+    here.hang_up()
+    assert here.recv(100) == b""
+
+
+def test_an_end_stays_although_a_packet_arrived_meanwhile(pair: Pair) -> None:
+    here, there, raw = pair
+
+    class HungUp(CutShort):
+        def recv(self, size: int, flags: int = 0) -> bytes:
+            there.hang_up()
+            return raw.recv(size, flags)
+
+    here.send(b"packet")
+    raw, there._socket = there._socket, HungUp(raw, 0)  # type: ignore[assignment]
+    there.recv(100)
+    assert there._ended
+    there._socket = raw
+
+
+def test_a_rest_that_can_not_be_sent_is_forgotten_with_its_connection(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failing(CutShort):
+        def send(self, content: bytes) -> int:
+            raise OSError(errno.ENOBUFS, "No buffer space available")
+
+        def fileno(self) -> int:
+            return readable.fileno()
+
+    monkeypatch.setattr(_thread, "start_new_thread", lambda *_: None)
+    here, _, raw = pair
+    fill(here)
+    readable, other = socket.socketpair()  # there is room
+    with readable, other:
+        here._socket = Failing(raw, 0)  # type: ignore[assignment]
+        here._complete()
+        here._socket = raw
+    assert here._rest == b""
+    assert here.recv(100) == b""
+    with pytest.raises(OSError):  # noqa: PT011
+        here.send(b"mixed")
+
+
+def test_one_small_packet_follows_a_rest(pair: Pair) -> None:
+    """A stop is not refused because a large packet is on its way."""
+    here, there, _ = pair
+    sent = fill(here)
+    assert is_refused(lambda: here.send(bytes(1025)))
+    here.send(b"stop" * 256, SEND_FLAGS)
+    assert is_refused(lambda: here.send(b"second"))
+    assert [len(there.recv(MAX_PACKET)) for _ in range(sent)] == [MAX_PACKET] * sent
+    assert there.recv(2000) == b"stop" * 256
+    wait_until(lambda: not here._rest, "it knows")
+    here.send(b"third")
+    assert there.recv(100) == b"third"
 
 
 # --- killed processes ---

@@ -227,7 +227,7 @@ class ControlServer:
         self._ended.set()
         listener.hang_up()
         self._thread.join()
-        self._directory.remove(self._name, self._inode)
+        self._directory.remove(self._name, self._inode, listener)
 
     def _run(self, listener: Listener) -> None:
         while self._listener is not None:

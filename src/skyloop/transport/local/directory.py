@@ -184,13 +184,16 @@ class Directory:
                 system.remove(other)
             return self.serving.listen(path, self.gid), path.lstat().st_ino
 
-    def remove(self, name: str, inode: int) -> None:
-        """Remove the socket with this name if its file still has this inode. Errors are ignored."""
+    def remove(self, name: str, inode: int, listener: Listener) -> None:
+        """Remove a listener's file if it still has this inode, and release the name. Errors are ignored."""
         with contextlib.suppress(OSError, LinkError), self.lock():
             for system in systems().values():
                 path = self.path / (name + system.SUFFIXES[self._kind])
-                if path.exists() and path.lstat().st_ino == inode:
+                if path.exists() and path.lstat().st_ino == inode:  # an inode that the listener holds is no one else's
+                    if sys.platform == "win32":  # where a file that is open can't be removed
+                        listener.release()
                     system.remove(path)
+        listener.release()
 
     @contextlib.contextmanager
     def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:

@@ -124,6 +124,9 @@ class Socket(socket.socket):
         with suppress(OSError):  # the connection had already ended
             self.shutdown(socket.SHUT_RDWR)
 
+    def release(self) -> None:
+        """Do nothing: the name is free as soon as the listener hangs up. The open socket keeps its file's inode."""
+
 
 def credentials(sock: socket.socket) -> Credentials:
     """Return the connecting process or, if called by a client, the listening one."""

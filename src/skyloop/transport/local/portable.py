@@ -6,7 +6,8 @@ users of the host, and programs that took over the port of an ended server, lear
 its registration. The lock ends with the process and shows whether it still runs.
 
 Each packet follows its length in four bytes. If the kernel takes only a part of a packet, a thread sends the rest when
-there is room, and further packets are refused until then. The server is then told, so that it sends the newest frame.
+there is room, also after the sender has hung up. Until then, one small packet may follow it, such as a stop, and
+further ones are refused. The server is then told, so that it sends the newest frame.
 """
 
 from __future__ import annotations
@@ -60,7 +61,11 @@ _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
 _LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
+_REST_S: Final = 1.0  # time for the rest of a packet after its sender has hung up
+_REST_SLICE_MS: Final = 250  # how often its thread looks whether it has
+_SMALL: Final = 1024  # longest packet that may follow a rest
 _MOST_WAITING: Final = 128
+_MOST_SELECTED: Final = 512  # what Windows' select waits for
 _FAILED_S: Final = 0.2  # pause after a failure to accept, when descriptors or memory have run out
 _REGISTRATION: Final = struct.Struct("<8sHHI32s32s")  # magic, version, port, process, secret, names of its memory
 _MAGIC: Final = b"SkyPort\n"
@@ -85,6 +90,7 @@ class Registration(NamedTuple):
         return hmac.digest(self.secret, said, hashlib.sha256)
 
 
+_NOT_LET_IN: Final = "it closed the connection too early; perhaps too many others are connecting, so try again"
 _TURNED_AWAY: Final = "a process that wanted to connect was turned away"
 _CLIENT: Final = b"skyloop client"
 _SERVER: Final = b"skyloop server"
@@ -117,7 +123,8 @@ class StreamSocket:
         # Re-entrant, because the garbage collector or a signal's handler may send in the middle of another call.
         self._sending = threading.RLock()
         self._inside = False  # whether a call that sends is under way
-        self._rest = b""  # the unsent end of a packet that was sent in part
+        self._rest = b""  # the unsent end of a packet that was sent in part, and a small one behind it
+        self._followed = False  # whether there is one
         self._awaiting_room = False  # whether a thread waits until something fits again
         self._has_room: Callable[[], object] | None = None
         self._partial = bytearray()  # the beginning of an incomplete packet, with its length
@@ -136,25 +143,50 @@ class StreamSocket:
         return len(packet)
 
     def _send(self, packet: bytes) -> None:
+        if self._ended:
+            raise BrokenPipeError(errno.EPIPE, "the connection has ended")
         if self._inside:
             raise BlockingIOError(errno.EAGAIN, "this thread is sending")
         self._inside = True
         try:
-            self._send_rest()
-            content = len(packet).to_bytes(_LENGTH, "little") + packet
-            self._rest = content[self._socket.send(content) :]
-        except BlockingIOError:
-            self._await_room()
-            raise
-        else:
-            if self._rest:
+            accepted = self._offer(len(packet).to_bytes(_LENGTH, "little") + packet)
+            if self._rest or not accepted:
                 self._await_room()
+        except OSError:
+            raise
+        except BaseException:  # raised by a signal's handler: it is unknown how much the kernel took
+            self._break()
+            raise
         finally:
             self._inside = False
+        if not accepted:
+            raise BlockingIOError(errno.EAGAIN, "it does not fit now")
+
+    def _offer(self, content: bytes) -> bool:
+        """Send a packet with its length, at least in part; return False if it is refused."""
+        try:
+            if self._rest:
+                self._send_rest()
+            self._rest = content[self._socket.send(content) :]
+        except BlockingIOError:
+            if not self._rest or self._followed or len(content) > _LENGTH + _SMALL:
+                return False
+            self._rest, self._followed = self._rest + content, True
+        return True
 
     def _send_rest(self) -> None:
         while self._rest:
             self._rest = self._rest[self._socket.send(self._rest) :]
+        self._followed = False
+
+    def _break(self) -> None:
+        """End the connection at once, because the boundary between packets is lost."""
+        self._ended, self._rest = True, b""
+        self._shut_down(socket.SHUT_RDWR)
+
+    def _shut_down(self, how: int) -> None:
+        with suppress(OSError):  # the connection had already ended
+            self._socket.shutdown(how)
 
     def _await_room(self) -> None:
         if not self._awaiting_room:
@@ -162,20 +194,39 @@ class StreamSocket:
             try:
                 _thread.start_new_thread(self._complete, ())
             except RuntimeError as error:  # no more threads
-                self.hang_up()
+                self._break()
                 raise ConnectionAbortedError(errno.ECONNABORTED, str(error)) from None
 
     def _complete(self) -> None:
-        """Send the rest of a packet as soon as there is room, and tell the server so."""
-        with suppress(OSError, ValueError):  # the connection has ended, or was closed
-            wait = _waiter(self._socket, to_send=True)
-            while self._awaiting_room and not self._ended:
-                wait(_SLICE_MS)
-                with self._sending, suppress(BlockingIOError):
+        """Send the rest of a packet as soon as there is room, and tell the server so, or end the connection."""
+        try:
+            self._wait_and_send()
+        except BaseException as error:
+            self._break()
+            if not isinstance(error, (OSError, ValueError)):  # the connection has ended, or was closed
+                raise
+        self._awaiting_room = False
+        if self._ended:
+            self._shut_down(socket.SHUT_RDWR)
+        elif (has_room := self._has_room) is not None:
+            with suppress(OSError, ValueError):
+                has_room()
+
+    def _wait_and_send(self) -> None:
+        wait, deadline_s = _waiter(self._socket, to_send=True), math.inf
+        while self._awaiting_room and time.monotonic() < deadline_s:
+            wait(_REST_SLICE_MS)
+            with self._sending:
+                self._inside = True
+                try:
                     self._send_rest()
                     self._awaiting_room = False
-            if (has_room := self._has_room) is not None:
-                has_room()
+                except BlockingIOError:
+                    pass
+                finally:
+                    self._inside = False
+            if self._ended:
+                deadline_s = min(deadline_s, time.monotonic() + _REST_S)
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
         raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
@@ -205,8 +256,14 @@ class StreamSocket:
                     raise
                 self._wait()
                 continue
-            self._ended = not packet
-            return packet
+            except OSError:
+                raise
+            except BaseException:  # raised by a signal's handler: it is unknown how much was taken from the kernel
+                self._break()
+                raise
+            if packet:
+                return packet
+            break
         self._ended = True
         return b""
 
@@ -226,9 +283,7 @@ class StreamSocket:
     def _next(self, size: int) -> bytes:
         """Return the next packet; empty at the end. ``BlockingIOError``: it has not arrived completely."""
         receive, partial = self._socket.recv, self._partial
-        # In the usual case, one call takes a whole packet. If a signal's handler raises an exception behind that call,
-        # a packet is lost, as with any socket, but not the boundary between packets.
-        if not partial:
+        if not partial:  # in the usual case, one call takes a whole packet
             head = receive(_LENGTH, socket.MSG_PEEK)
             if not head:
                 return b""
@@ -268,7 +323,8 @@ class StreamSocket:
         self._has_room = call
 
     def limit_backlog(self) -> None:
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
+        with suppress(OSError):  # it has been reset, which macOS reports here
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, self._backlog)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
         if last_packet:
@@ -276,8 +332,10 @@ class StreamSocket:
                 self.send(last_packet, SEND_FLAGS)
         self._ended = True
         self._has_room = None
-        with suppress(OSError):  # the connection had already ended
-            self._socket.shutdown(socket.SHUT_RDWR)
+        if not (self._rest and self._awaiting_room):
+            self._shut_down(socket.SHUT_RDWR)
+        elif sys.platform != "win32":  # its thread does the rest; Windows would reset the connection
+            self._shut_down(socket.SHUT_RD)
 
     def close(self) -> None:
         self._socket.close()
@@ -311,6 +369,8 @@ class SelectorPoller:
             return []
 
     def register(self, fileno: int) -> None:
+        if isinstance(self._selector, selectors.SelectSelector) and len(self._selector.get_map()) >= _MOST_SELECTED:
+            raise OSError(errno.EMFILE, "too many sockets for this system")
         with suppress(KeyError):
             self._selector.register(fileno, selectors.EVENT_READ)
         self.wake()  # not every selector notices it otherwise
@@ -358,7 +418,13 @@ def listen(path: Path, gid: int | None) -> Gate:
         listener.bind((_HOST, 0))
         listener.listen(128)
         registration = Registration(listener.getsockname()[1], os.getpid(), os.urandom(32), prefix())
-        return Gate(listener, registration, path, _register(path, registration))
+        lock = _register(path, registration)
+        try:
+            return Gate(listener, registration, path.name, lock)
+        except BaseException:
+            os.close(lock)
+            path.unlink(missing_ok=True)
+            raise
     except BaseException:
         listener.close()
         raise
@@ -469,7 +535,7 @@ def _receive(sock: socket.socket, size: int, deadline_s: float) -> bytes:
     while len(content) < size:
         sock.settimeout(max(1e-3, deadline_s - time.monotonic()))
         if not (more := sock.recv(size - len(content))):
-            raise ConnectionAbortedError(errno.ECONNABORTED, "it turned this process away")
+            raise ConnectionAbortedError(errno.ECONNABORTED, _NOT_LET_IN)
         content += more
     return content
 
@@ -491,30 +557,49 @@ def _challenge(sock: socket.socket, registration: Registration, deadline_s: floa
 class Gate:
     """A server's socket. It lets only those in that know the secret, each of which has a thread until then."""
 
-    def __init__(self, listener: socket.socket, registration: Registration, path: Path, lock: int) -> None:
+    _lock = -1
+    _ends: tuple[socket.socket, ...] = ()
+
+    def __init__(self, listener: socket.socket, registration: Registration, name: str, lock: int) -> None:
         listener.settimeout(HANDSHAKE_S)
         self._listener = listener
         self._registration = registration
-        self._path = path
-        self._lock = lock
+        self._name = name
         self._strangers: dict[socket.socket, None] = {}  # oldest first
+        self._meeting = threading.Lock()  # guards those
         self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
-        self._woken, self._bell = socket.socketpair()  # a byte for each of those
+        self._ends = self._woken, self._bell = socket.socketpair()  # a byte for each of those
         self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
         self._bell.setblocking(False)
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="skyloop-gate", daemon=True)
         self._thread.start()
+        self._lock = lock  # its owner from here on
         leave_to_parent(self)
 
     def __del__(self) -> None:
-        self._woken.close()
+        for end in self._ends:
+            end.close()
+        self.release()
 
     def forked(self) -> None:
         """Close a forked child's copies. Otherwise, the registration would stay locked after the parent's end."""
-        self._listener.close()
-        if self._lock >= 0:
-            os.close(self._lock)
+        for copy in (self._listener, *self._ends):
+            copy.close()
+        lock, self._lock = self._lock, -1
+        if lock >= 0:
+            os.close(lock)
+
+    def release(self) -> None:
+        """Empty the registration and unlock it. If it could not be removed, the next listing does that.
+
+        The memory is not that listing's to remove, because other servers of this process may still use it.
+        """
+        lock, self._lock = self._lock, -1
+        if lock >= 0:
+            with suppress(OSError):
+                os.ftruncate(lock, 0)
+            os.close(lock)
 
     def fileno(self) -> int:
         return self._woken.fileno()
@@ -539,33 +624,37 @@ class Gate:
     def _run(self) -> None:
         while not self._closing:
             try:
-                sock, _ = self._listener.accept()
+                self._meet(self._listener.accept()[0])
             except (TimeoutError, ConnectionError):
                 continue
-            except OSError as error:  # descriptors or memory have run out
-                _log.warning("%s cannot accept: %s", self._path.name, error)
+            except Exception as error:  # noqa: BLE001  e.g. no more descriptors, memory or threads; others may come
+                _log.warning("%s cannot accept: %r", self._name, error)
                 time.sleep(_FAILED_S)
-                continue
-            if len(self._strangers) >= MAX_STRANGERS and (oldest := next(iter(self._strangers), None)):
-                self._strangers.pop(oldest, None)
-                with suppress(OSError):  # its thread ends it
-                    oldest.shutdown(socket.SHUT_RDWR)
-                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
-            self._strangers[sock] = None
-            try:
-                threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
-            except RuntimeError as error:  # no more threads
-                _log.warning("%s cannot accept: %s", self._path.name, error)
-                self._strangers.pop(sock)
-                sock.close()
         self._listener.close()
-        if sys.platform != "win32":  # a locked file can be removed, so that no one takes it for that of a killed proxy
-            with suppress(OSError):
-                if self._path.lstat().st_ino == os.fstat(self._lock).st_ino:
-                    self._path.unlink()
-        lock, self._lock = self._lock, -1
-        os.close(lock)
-        self._bell.close()
+        with suppress(OSError):  # wakes ``accept``, even if a process holds a copy of this socket
+            self._bell.shutdown(socket.SHUT_RDWR)
+
+    def _meet(self, sock: socket.socket) -> None:
+        """Start to greet a stranger. If there are too many, the oldest gives way."""
+        try:
+            with self._meeting:
+                oldest = next(iter(self._strangers), None) if len(self._strangers) >= MAX_STRANGERS else None
+                if oldest is not None:
+                    del self._strangers[oldest]
+                    with suppress(OSError):  # its thread ends it
+                        oldest.shutdown(socket.SHUT_RDWR)
+                self._strangers[sock] = None
+            if oldest is not None:
+                self._pass_on(f"{_TURNED_AWAY}: others wanted to connect")
+            threading.Thread(target=self._greet, args=(sock,), name="skyloop-greeting", daemon=True).start()
+        except BaseException:
+            self._part(sock)
+            sock.close()
+            raise
+
+    def _part(self, sock: socket.socket) -> None:
+        with self._meeting:
+            self._strangers.pop(sock, None)
 
     def _greet(self, sock: socket.socket) -> None:
         found: StreamSocket | str = ""
@@ -578,9 +667,10 @@ class Gate:
             found = f"{_TURNED_AWAY}: it did not prove within {HANDSHAKE_S:g} s that it knows the secret"
         except OSError:
             pass  # it only looked who is there, or gave up
-        self._strangers.pop(sock, None)
-        if isinstance(found, str):
-            sock.close()
+        finally:
+            self._part(sock)
+            if isinstance(found, str):
+                sock.close()
         if found:
             self._pass_on(found)
 

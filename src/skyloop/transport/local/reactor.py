@@ -79,10 +79,10 @@ class Reactor:
         self._thread.start()
 
     def add(self, source: Source) -> None:
-        """Start waiting for a socket. Thread-safe."""
+        """Start waiting for a socket. Thread-safe. Raises ``OSError`` beyond the system's limit."""
         with self._lock:
-            self._sources[source.fileno] = source
             self._poller.register(source.fileno)
+            self._sources[source.fileno] = source
 
     def remove(self, source: Source) -> bool:
         """Stop waiting for a socket; return whether this reactor was waiting for it. Thread-safe."""
@@ -150,11 +150,11 @@ class Reactor:
             if not busy:
                 self.inside = None
             begun_s = time.monotonic()
-            ready = poll(0 if busy else CHECK_S)
-            # After a pause, a packet is most likely the only one. If there are many, checking each socket for another
-            # one would cost a system call each; instead, all sockets are polled together until nothing new arrives.
-            waited = time.monotonic() - begun_s > _PAUSE_S
             try:
+                ready = poll(0 if busy else CHECK_S)
+                # After a pause, a packet is most likely the only one. If there are many, checking each socket for
+                # another one would cost a system call each; instead, all are polled together until nothing new arrives.
+                waited = time.monotonic() - begun_s > _PAUSE_S
                 if self._receive(ready, at_once=waited and len(ready) == 1):
                     for _ in range(MOST_PACKETS):
                         if not self._receive(poll(0), at_once=False):
@@ -220,9 +220,9 @@ class Reactor:
             sources = list(self._sources.values())
         for source in sources:
             if source.muted:
-                source.muted = False
                 with self._lock, contextlib.suppress(OSError):
                     self._poller.mute(source.fileno, False)
+                    source.muted = False  # otherwise, it is retried
             elif source.connection is not None and not source.connection.joined:
                 self._enter(source.server)
                 source.server.end_silent(self, source, now_s)
@@ -250,11 +250,11 @@ class SharedLocalServer(LocalServer):
         self._listening = Source(self, sock=listener)
         self.reactor.add(self._listening)
 
-    def _finish(self, listener: Listener) -> None:  # noqa: ARG002  (the source owns it)
+    def _finish(self, listener: Listener) -> None:
         source, self._listening = self._listening, None
         if source is not None:
             self._drop(source)
-        self._directory.remove(self._name, self._inode)
+        self._directory.remove(self._name, self._inode, listener)
         for connection in list(self._connections):
             connection.hang_up("the proxy stopped")
         # A handler that stops its own server must not wait for itself.
@@ -366,7 +366,12 @@ class SharedLocalServer(LocalServer):
         if connection is not None:
             with self._left:
                 self._served.add(connection)
-            reactor.add(Source(self, connection=connection))
+            own = Source(self, connection=connection)
+            try:
+                reactor.add(own)
+            except OSError as error:
+                self._finish_connection(own, connection, f"{self.address} can't receive from it: {error.strerror}")
+                return
             if self._stopping.is_set():  # an application that connected while the others were being disconnected
                 connection.hang_up("the proxy stopped")
 

@@ -156,7 +156,13 @@ class LocalServer(TransportServer):
             listener, inode = self._directory.listen(self._name)
             self._started = True
             self._listener = listener
-            self._begin(handler, listener, inode)
+            try:
+                self._begin(handler, listener, inode)
+            except BaseException:
+                self._listener = None
+                listener.hang_up()
+                self._directory.remove(self._name, inode, listener)
+                raise
 
     def _begin(self, handler: ServerHandler, listener: Listener, inode: int) -> None:
         """Start accepting and receiving."""
@@ -243,7 +249,7 @@ class LocalServer(TransportServer):
                 if thread is not None:
                     threads = [thread, *(other for other in threads if other.is_alive())]
         finally:
-            self._directory.remove(self._name, inode)
+            self._directory.remove(self._name, inode, listener)
             for connection in list(self._connections):
                 connection.hang_up("the proxy stopped")
             for thread in threads:
@@ -287,7 +293,15 @@ class LocalServer(TransportServer):
                 _log.exception("the handler of %s failed in refused()", self.address)
 
     def _let_in(self, sock: PacketSocket) -> ServerConnection | None:
-        """Return the caller's connection; None if the caller may not connect or there is no room."""
+        """Return the caller's connection; None if it failed, the caller may not connect, or there is no room."""
+        try:
+            return self._examine(sock)
+        except Exception as error:  # noqa: BLE001  it must end only this connection
+            _log.warning("%s could not let a connection in: %r", self.address, error)
+            sock.hang_up()
+            return None
+
+    def _examine(self, sock: PacketSocket) -> ServerConnection | None:
         who = sock.who
         if not self._system.may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))

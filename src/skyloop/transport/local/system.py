@@ -106,12 +106,16 @@ class StrangerError(ConnectionError):
 
 
 class Listener(Protocol):
-    """A server's socket. ``accept`` also raises :class:`StrangerError`; ``hang_up`` wakes the thread that is in it."""
+    """A server's socket. ``accept`` also raises :class:`StrangerError`; ``hang_up`` wakes the thread that is in it.
+
+    The name is in use until ``release``, which is for after the file's removal (on Windows, for just before it).
+    """
 
     def accept(self) -> tuple[PacketSocket, object]: ...
     def setblocking(self, flag: bool, /) -> None: ...
     def fileno(self) -> int: ...
     def hang_up(self) -> None: ...
+    def release(self) -> None: ...
 
 
 class Poller(Protocol):
