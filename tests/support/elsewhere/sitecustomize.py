@@ -26,6 +26,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -195,6 +196,16 @@ def _link(source: Any, target: Any, *, follow_symlinks: bool = True) -> None:
     os.link(source, target)
 
 
+#: Before Python 3.13: ``monotonic`` is ``GetTickCount64``, in steps of 15.6 ms, and ``perf_counter`` begins elsewhere.
+_TICK_NS = 15_625_000
+_WINDOWS_CLOCKS: Mapping[str, Callable[[], float]] = {
+    "monotonic_ns": lambda: time.monotonic_ns() // _TICK_NS * _TICK_NS,
+    "monotonic": lambda: time.monotonic_ns() // _TICK_NS * _TICK_NS / 1e9,
+    "perf_counter_ns": lambda: time.perf_counter_ns() + 10**15,
+    "perf_counter": lambda: time.perf_counter() + 1e6,
+}
+
+
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
     """Wait as on Windows before Python 3.14, where Ctrl-C does not end a wait for a lock."""
@@ -288,8 +299,6 @@ def _windows() -> dict[str, types.ModuleType]:
 
 def stand_ins(system: str) -> dict[str, types.ModuleType]:
     """Return the modules that Skyloop gets in place of the real ones."""
-    import time
-
     real = {**_REAL_NAMES, "time": time}
     found: dict[str, types.ModuleType] = {
         name: _StandIn(real[name], missing) for name, missing in _MISSING[system].items()
@@ -299,6 +308,7 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
         found |= _windows()
         found["mmap"].__dict__["mmap"] = TaggedMemory
         found["select"].__dict__["select"] = _only_sockets
+        found["time"].__dict__.update(_WINDOWS_CLOCKS)
         found["signal"].__dict__["SIGBREAK"] = signal.SIGUSR1
         found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)
     return found
