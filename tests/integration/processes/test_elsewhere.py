@@ -198,6 +198,7 @@ def test_three_drones(start: Callable[..., Process]) -> None:
 
 def test_the_page_flies_and_a_file_is_reloaded(start: Callable[..., Process], tmp_path: Path) -> None:
     from websockets.sync.client import connect
+    from websockets.typing import Origin
 
     start("-m", "skyloop", "sim", "--name", "alpha", "--world", "empty").until("ready", 60)
     page = start("-m", "skyloop", "cockpit", "--port", "0", "--recordings", str(tmp_path))
@@ -218,7 +219,7 @@ def test_the_page_flies_and_a_file_is_reloaded(start: Callable[..., Process], tm
         skyloop.connect("alpha", access="observe") as observer,
         connect(
             f"{address.replace('http', 'ws')}/ws/drones/alpha/control",
-            origin=address,  # type: ignore[arg-type]
+            origin=Origin(address),
             additional_headers={"cookie": cookie},
         ) as socket,
     ):
@@ -288,7 +289,7 @@ def test_an_emulated_tello(start: Callable[..., Process]) -> None:
 
 def test_keys_in_the_console(start: Callable[..., Process], system: str) -> None:
     proxy_at(start)
-    up, person = {"win32": b"\xe0H", "darwin": b"\x1b[A"}[system], -1
+    up = {"win32": b"\xe0H", "darwin": b"\x1b[A"}[system]
     person, console = pty.openpty()
     with (
         skyloop.connect("alpha", access="observe") as observer,

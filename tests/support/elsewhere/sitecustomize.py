@@ -16,6 +16,7 @@ import contextlib
 import errno
 import importlib.abc
 import importlib.machinery
+import itertools
 import mmap
 import os
 import select
@@ -158,10 +159,8 @@ def _keep_open_files() -> None:
 
         return call
 
-    for name in ("unlink", "rename", "replace"):
-        setattr(Path, name, guarded(Path, name))
-        setattr(os, name, guarded(os, name))
-    os.remove = guarded(os, "remove")
+    for owner, name in itertools.product((Path, os), ("unlink", "rename", "replace")):
+        setattr(owner, name, guarded(owner, name))
 
 
 def _only_sockets(*waited: Any) -> Any:
