@@ -98,7 +98,7 @@ class TaggedMemory(mmap.mmap):
         cls, number: int, length: int, *args: Any, tagname: str = "", access: int = 0, **more: Any
     ) -> TaggedMemory:
         if not tagname:
-            return super().__new__(cls, number, length, *args, access=access, **more)
+            return super().__new__(cls, number, length, *args, access=access, **more)  # type: ignore[misc]
         path = f"/dev/shm/as-on-windows-{tagname}"
         file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         if os.fstat(file).st_size == 0:
