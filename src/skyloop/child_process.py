@@ -139,18 +139,13 @@ class ChildProcess:
             self._process.stdin.close()
 
     def terminate(self) -> None:
-        """Send SIGTERM to the child. Does not wait. Idempotent.
-
-        On Windows, ``TerminateProcess`` would kill it, and a flying vehicle could not land. There, a line on its
-        standard input makes :func:`on_parent_end` raise the signal.
-        """
-        if sys.platform != "win32":
-            if self._ours:
-                self._process.terminate()
-        elif self._ours and self._process.stdin is not None:
+        """Send SIGTERM to the child; on Windows, make :func:`on_parent_end` raise it. Does not wait. Idempotent."""
+        if self._ours and sys.platform == "win32":  # TerminateProcess would kill it, and its vehicle could not land
+            assert self._process.stdin is not None
             with suppress(OSError, ValueError):  # it has ended, or was already asked to exit
-                self._process.stdin.write(_TERMINATE)
-                self._process.stdin.flush()
+                os.write(self._process.stdin.fileno(), _TERMINATE)
+        elif self._ours:
+            self._process.terminate()
 
     def kill(self) -> None:
         """Kill the child. Does not wait. Idempotent."""

@@ -23,10 +23,8 @@ NS_PER_S: Final = 1_000_000_000
 #: 5 ms, each packet in a flood could delay a command by 5 ms.
 SWITCH_INTERVAL_S: Final = 0.001
 
-#: ``time.monotonic`` counts in steps of 15.6 ms on Windows before Python 3.13, where it is the performance counter.
-monotonic_ns: Clock = (
-    time.perf_counter_ns if sys.platform == "win32" and sys.version_info < (3, 13) else time.monotonic_ns
-)
+#: The clock of drivers and applications too (docs/drivers.md). On Windows, it has steps of 15.6 ms before Python 3.13.
+monotonic_ns: Clock = time.monotonic_ns
 
 
 def seconds(ns: int) -> float:

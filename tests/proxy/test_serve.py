@@ -101,7 +101,6 @@ def test_a_signal_lands_first_and_has_a_reason(start: Start, number: signal.Sign
 def test_ctrl_break_is_a_signal_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """On Windows, as is the end of the console; there, it ended the proxy without a landing."""
     monkeypatch.setattr(signal, "SIGBREAK", signal.SIGUSR1, raising=False)
-    monkeypatch.setattr(sys, "platform", "win32")
     shutdown = Shutdown()
     with on_signals(shutdown, ignore_interrupt=False):
         signal.raise_signal(signal.SIGUSR1)

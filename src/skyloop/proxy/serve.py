@@ -257,10 +257,7 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGINT (unless the parent handles it) and SIGTERM request the end of the process. Main thread only.
-
-    On Windows, so does SIGBREAK, which Ctrl-Break and the closing of the console's window cause.
-    """
+    """Make SIGTERM, and unless the parent handles them SIGINT and SIGBREAK, request the end. Main thread only."""
 
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)

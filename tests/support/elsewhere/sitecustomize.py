@@ -15,6 +15,7 @@ import contextlib
 import errno
 import importlib.abc
 import importlib.machinery
+import itertools
 import mmap
 import os
 import select
@@ -25,6 +26,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -124,20 +126,6 @@ def _open_as(link: str) -> Iterator[Path]:
                 yield path
 
 
-def _hold_open_files(event: str, given: tuple[Any, ...]) -> None:
-    """Let no module of Skyloop remove or rename a file that a process has open, nor rename another one to its name."""
-    if event not in ("os.remove", "os.rename"):
-        return
-    frame: types.FrameType | None = sys._getframe(1)
-    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("pathlib", "os"):
-        frame = frame.f_back
-    if frame is None or not frame.f_globals.get("__name__", "").startswith("skyloop."):
-        return
-    for path in given[: 2 if event == "os.rename" else 1]:
-        if next(_open_as(os.path.realpath(path)), None) is not None:
-            raise PermissionError(13, "The process cannot access the file because it is being used", str(path))
-
-
 class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
     """Processes have flags, and ending one is the same as killing it."""
 
@@ -165,14 +153,7 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
 
 def _is_open(path: Any) -> bool:
     """Return whether any process has this file open. Python opens files on Windows so that no one can remove them."""
-    place = os.path.realpath(path)
-    for descriptors in Path("/proc").glob("[0-9]*/fd"):
-        with contextlib.suppress(OSError):  # another user's process, or one that has just ended
-            for descriptor in descriptors.iterdir():
-                with contextlib.suppress(OSError):
-                    if str(descriptor.readlink()) == place:
-                        return True
-    return False
+    return next(_open_as(os.path.realpath(path)), None) is not None
 
 
 def _keep_open_files() -> None:
@@ -190,10 +171,8 @@ def _keep_open_files() -> None:
 
         return call
 
-    for name in ("unlink", "rename", "replace"):
-        setattr(Path, name, guarded(Path, name))
-        setattr(os, name, guarded(os, name))
-    os.remove = guarded(os, "remove")
+    for owner, name in itertools.product((Path, os), ("unlink", "rename", "replace")):
+        setattr(owner, name, guarded(owner, name))
 
 
 def _only_sockets(*waited: Any) -> Any:
@@ -226,6 +205,16 @@ def _link(source: Any, target: Any, *, follow_symlinks: bool = True) -> None:
     if not follow_symlinks:
         raise NotImplementedError("link: follow_symlinks unavailable on this platform")
     os.link(source, target)
+
+
+#: Before Python 3.13: ``monotonic`` is ``GetTickCount64``, in steps of 15.6 ms, and ``perf_counter`` begins elsewhere.
+_TICK_NS = 15_625_000
+_WINDOWS_CLOCKS: Mapping[str, Callable[[], float]] = {
+    "monotonic_ns": lambda: time.monotonic_ns() // _TICK_NS * _TICK_NS,
+    "monotonic": lambda: time.monotonic_ns() // _TICK_NS * _TICK_NS / 1e9,
+    "perf_counter_ns": lambda: time.perf_counter_ns() + 10**15,
+    "perf_counter": lambda: time.perf_counter() + 1e6,
+}
 
 
 @contextlib.contextmanager
@@ -321,8 +310,6 @@ def _windows() -> dict[str, types.ModuleType]:
 
 def stand_ins(system: str) -> dict[str, types.ModuleType]:
     """Return the modules that Skyloop gets in place of the real ones."""
-    import time
-
     real = {**_REAL_NAMES, "time": time}
     found: dict[str, types.ModuleType] = {
         name: _StandIn(real[name], missing) for name, missing in _MISSING[system].items()
@@ -332,6 +319,7 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
         found |= _windows()
         found["mmap"].__dict__["mmap"] = TaggedMemory
         found["select"].__dict__["select"] = _only_sockets
+        found["time"].__dict__.update(_WINDOWS_CLOCKS)
         found["signal"].__dict__["SIGBREAK"] = signal.SIGUSR1
         found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)
     return found
