@@ -319,7 +319,12 @@ def test_keys_in_the_console(start: Callable[..., Process], system: str) -> None
             press(up, lambda feedback: feedback.velocity_m_s[2] > 0.2)
             press(b"l", lambda feedback: feedback.state == "landed")
             os.write(person, b"q")
-            eventually(lambda: shown() is None and teleop.poll() is not None, "it ends")
+
+            def ended() -> bool:
+                shown()
+                return teleop.poll() is not None
+
+            eventually(ended, "it ends")
         except OSError:  # the other end is closed
             pass
         finally:
