@@ -262,9 +262,7 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
 
-    interrupts = [signal.SIGINT]
-    if sys.platform == "win32":
-        interrupts.append(signal.SIGBREAK)
+    interrupts = {signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGINT)}
     before = {one: signal.signal(one, signal.SIG_IGN if ignore_interrupt else asked) for one in interrupts}
     before[signal.SIGTERM] = signal.signal(signal.SIGTERM, asked)
     try:
