@@ -624,7 +624,11 @@ class Gate:
     def _run(self) -> None:
         while not self._closing:
             try:
-                self._meet(self._listener.accept()[0])
+                sock, _ = self._listener.accept()
+                if self._closing:  # it only woke this thread
+                    sock.close()
+                    break
+                self._meet(sock)
             except (TimeoutError, ConnectionError):
                 continue
             except Exception as error:  # noqa: BLE001  e.g. no more descriptors, memory or threads; others may come
