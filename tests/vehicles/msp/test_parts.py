@@ -17,7 +17,7 @@ from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.firmware import Setup, hindrances
 from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
+from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
 from skyloop.vehicles.msp.telemetry import PATIENCE_NS, Motion, MotionEstimate, Questions, Telemetry, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
@@ -154,7 +154,7 @@ def test_charge() -> None:
 
 
 def test_parameters() -> None:
-    setpoints = SetpointController()
+    setpoints = MspSetpoints()
     parameters = DriverParameters(setpoints)
     parameters.write("limits.tilt", 0.3)
     parameters.write("msp.aux3", 1700)
@@ -335,9 +335,9 @@ def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_rese
     assert see(overridden=True, seconds=0.02) == pytest.approx(1420, abs=2), "after the reset it is adopted in flight"
 
 
-def given_away() -> SetpointController:
+def given_away() -> MspSetpoints:
     """Return a controller after a pilot flew by receiver at a throttle of 0.42 and handed over the sticks."""
-    setpoints = SetpointController(override=True)
+    setpoints = MspSetpoints(override=True)
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     setpoints.on_report(Report(armed=True), 0)
     assert setpoints.left_to == "RECEIVER"
@@ -352,7 +352,7 @@ def given_away() -> SetpointController:
 @pytest.mark.parametrize("climbs", [False, True])
 def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(climbs: bool) -> None:
     """It tipped over, or a switch killed it: 20 ms later the software take-off armed it again."""
-    setpoints = SetpointController()
+    setpoints = MspSetpoints()
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     setpoints.receiving = True
     estimate = MotionEstimate()
@@ -372,7 +372,7 @@ def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(
 
 def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_landing() -> None:
     """A simulated world ran slower than the firmware's clock: its motors were stopped at 1.6 m, without an event."""
-    setpoints, now_ns = SetpointController(), 0
+    setpoints, now_ns = MspSetpoints(), 0
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     setpoints.receiving, setpoints.phase, setpoints.hover = True, Phase.FLYING, 0.4
 
@@ -399,7 +399,7 @@ def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_
 
 def test_a_vehicle_found_again_disarmed_can_take_off_at_once() -> None:
     """Its firmware restarted in flight: the earlier take-off is over, and none continues."""
-    setpoints = SetpointController()
+    setpoints = MspSetpoints()
     setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)

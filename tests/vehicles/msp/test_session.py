@@ -15,7 +15,7 @@ from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
 from skyloop.vehicles.msp.emulator import EMPTY_WRITES, BoardSettings, bit
 from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
+from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
 from skyloop.vehicles.msp.telemetry import Motion
 from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
@@ -108,9 +108,9 @@ NOISES = (0.05, 0.1, 0.2)  # of the climb [m/s]; that of a position of 1 cm is 0
 SEEDS = 20
 
 
-def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[SetpointController, list[float]]:
+def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[MspSetpoints, list[float]]:
     """Return a vehicle asked to sink at 0.4 m/s, and its throttle as a share of the hover throttle."""
-    setpoints, chance, now_ns, shares = SetpointController(), random.Random(seed), NS_PER_S, []
+    setpoints, chance, now_ns, shares = MspSetpoints(), random.Random(seed), NS_PER_S, []
     setpoints.on_report(Report(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     setpoints.apply(Attitude(climb=-0.4), now_ns)
@@ -648,7 +648,7 @@ def test_no_stop_arms_a_vehicle_with_unknown_state_and_mode_names(silent: Functi
 
 def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -> None:
     """The centre of roll may be half throttle; a stop without an arm switch was sent as such."""
-    setpoints = SetpointController()
+    setpoints = MspSetpoints()
     setpoints.on_report(Report(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)
     assert setpoints.channels(10**9)[:4] == [1000] * 4
@@ -680,7 +680,7 @@ def test_a_stop_while_a_flying_vehicle_is_found_is_not_undone_by_adopting_it() -
 
 def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() -> None:
     """Neither during the stop nor after it has expired: else no pilot would look at it, or land it, any more."""
-    setpoints, now_ns = SetpointController(), 10**9
+    setpoints, now_ns = MspSetpoints(), 10**9
     setpoints.on_report(Report(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     assert setpoints.flight_state() is FlightState.FLYING

@@ -12,7 +12,7 @@ from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleS
 from skyloop.messages import AnyAction, EmergencyStop, EventKind, LinkState, Severity, Value
 from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Ids, Setup
 from skyloop.vehicles.ardrone.options import ArdroneOptions
-from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, limits_of
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints, Condition, limits_of
 from skyloop.vehicles.ardrone.telemetry import (
     ClimbMeter,
     DroneClock,
@@ -80,7 +80,7 @@ class ArdroneSession(VehicleSession):
         super().__init__(now_ns)
         self.options = options
         self.version = options.version  #: from the address, or None until the drone's configuration has been read
-        self.setpoints = SetpointController()
+        self.setpoints = ArdroneSetpoints()
         self.configurator = Configurator()
         self.reception = Reception()
         self.ready = False  #: whether the drone is set up and its configuration known
@@ -105,7 +105,7 @@ class ArdroneSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`ArdroneSetpoints.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)

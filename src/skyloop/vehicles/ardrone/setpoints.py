@@ -151,7 +151,7 @@ class Decision(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class ArdroneSetpoints:
     """Stores the last action and turns it into commands, tick by tick.
 
     ``reference_rad`` makes set-points relative to a heading (see :func:`skyloop.vehicles.ardrone.setpoints.motion`).

@@ -34,7 +34,7 @@ from skyloop.vehicles.mavlink.microservices import (
 )
 from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
 from skyloop.vehicles.mavlink.parameters import ParameterExchange
-from skyloop.vehicles.mavlink.setpoints import CUT, SetpointController
+from skyloop.vehicles.mavlink.setpoints import CUT, MavlinkSetpoints
 from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
 from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
@@ -106,7 +106,7 @@ class MavlinkSession(VehicleSession):
         self.commands = CommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
         self.autopilot: AutopilotProfile | None = None  #: None if unknown or not recognised yet
-        self.setpoints: SetpointController | None = None  #: None until the autopilot is known, or if it can't be flown
+        self.setpoints: MavlinkSetpoints | None = None  #: None until the autopilot is known, or if it can't be flown
         self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own limits
         self.dropped = 0  #: number of packets that the connection dropped
@@ -153,7 +153,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Raises an error if the vehicle can't be flown."""
+        """Accept an action; see :meth:`MavlinkSetpoints.apply`. Raises an error if the vehicle can't be flown."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found at any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -491,7 +491,7 @@ class MavlinkSession(VehicleSession):
         self.parameters.bytewise = found.BYTEWISE
         if not self._unsupported_reason:
             height_m = takeoff_height(self.limits)
-            self.setpoints = SetpointController(
+            self.setpoints = MavlinkSetpoints(
                 found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values), self._stop
             )
             self._publish_event(event_of(limits_text(self.limits), "limits"))

@@ -68,7 +68,7 @@ class Goal(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class MavlinkSetpoints:
     """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
     ``make_thrust`` creates the thrust model for an attitude-controlled flight; ``stop`` may be active already.

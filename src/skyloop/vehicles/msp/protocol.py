@@ -23,7 +23,7 @@ from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, Setup, hindrances
 from skyloop.vehicles.msp.parameters import MspOptions
-from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, Phase, Report, SetpointController
+from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, MspSetpoints, Phase, Report
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
@@ -60,10 +60,10 @@ class MspSession(VehicleSession):
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
-    def __init__(self, options: MspOptions, now_ns: int, setpoints: SetpointController | None = None) -> None:
+    def __init__(self, options: MspOptions, now_ns: int, setpoints: MspSetpoints | None = None) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.setpoints = setpoints or SetpointController(options.override)
+        self.setpoints = setpoints or MspSetpoints(options.override)
         self.motion = MotionEstimate()
         self.setup: Setup | None = None  #: None until the setup has been read
         self.reported = Reported()
@@ -96,7 +96,7 @@ class MspSession(VehicleSession):
     # From the driver -----------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`."""
+        """Accept an action; see :meth:`MspSetpoints.apply`."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         applied = self.setpoints.apply(action, now_ns)
         self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)

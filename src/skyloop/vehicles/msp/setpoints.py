@@ -103,7 +103,7 @@ class Report:
     overridden: bool = False  #: whether the pilot's switch is letting our sticks through
 
 
-class SetpointController:
+class MspSetpoints:
     """Stores the last set-point and turns it into receiver channels.
 
     With ``override``, a pilot keeps a real receiver, and nobody else can arm the vehicle.

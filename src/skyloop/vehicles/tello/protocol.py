@@ -21,7 +21,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severity, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import TelloOptions
-from skyloop.vehicles.tello.setpoints import SetpointController
+from skyloop.vehicles.tello.setpoints import TelloSetpoints
 from skyloop.vehicles.tello.telemetry import Health, feedback_of
 from skyloop.vehicles.tello.wire import ENTER, HOST, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
@@ -158,7 +158,7 @@ class TelloSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.setpoints = SetpointController()
+        self.setpoints = TelloSetpoints()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
         self._watch = RestartWatch()  # watches the count of seconds for which the motors have run
@@ -189,7 +189,7 @@ class TelloSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`TelloSetpoints.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)

@@ -98,7 +98,7 @@ class Decision(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class TelloSetpoints:
     """Stores the last action and turns it into commands.
 
     ``full`` is the effect of a full stick, and ``limits`` is the largest set-point.
