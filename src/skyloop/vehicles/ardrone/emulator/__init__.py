@@ -65,7 +65,7 @@ def with_ardrones(options: SimOptions | None = None) -> SimOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class ArdroneEmulatorSettings:
     """The arguments passed to :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
 
     version: int
@@ -243,7 +243,7 @@ DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 class RunningFirmware(RunningEmulator):
     """An AR.Drone that is switched on. Use its logic, ports and lists of clients only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: ArdroneEmulatorSettings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
@@ -455,7 +455,9 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         if version > 1:
             require_encoder()
         super().__init__(host, drone)
-        self.settings = Settings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
+        self.settings = ArdroneEmulatorSettings(
+            version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start
+        )
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)

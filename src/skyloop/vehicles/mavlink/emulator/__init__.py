@@ -34,9 +34,9 @@ from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
 from skyloop.vehicles.mavlink.emulator.links import (
     Kind,
+    MavlinkEmulatorSettings,
     Port,
     Ports,
-    Settings,
     Streams,
     TcpPort,
     UdpPort,
@@ -57,7 +57,7 @@ _KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px
 class RunningFirmware(RunningEmulator):
     """An autopilot that is switched on. Use it only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: MavlinkEmulatorSettings, loop: Loop | None) -> None:
         super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
@@ -149,7 +149,9 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         self._loop = loop
         delay_s = checked_delay(delay_s)
         ports = ports or Ports.standard(kind, drone)
-        self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
+        self.settings = MavlinkEmulatorSettings(
+            kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video
+        )
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)

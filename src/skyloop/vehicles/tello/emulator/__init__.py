@@ -100,7 +100,7 @@ def with_tellos(options: SimOptions | None = None) -> SimOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class TelloEmulatorSettings:
     """The arguments passed to :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
 
     sdk: Sdk
@@ -145,7 +145,7 @@ class TelloPacker:
 class RunningFirmware(RunningEmulator):
     """A Tello that is switched on. Use its logic and ports only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: TelloEmulatorSettings) -> None:
         super().__init__(host, drone, "skyloop-tello")
         self._settings = settings
         self._state_due_ns = 0
@@ -279,7 +279,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
                 raise UsageError(f"mission pads are numbered from {PADS[0]} to {PADS[-1]}, got {number!r}")
         require_encoder("the video of an emulated Tello")
         super().__init__(host, drone)
-        self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
+        self.settings = TelloEmulatorSettings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
