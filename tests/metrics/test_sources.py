@@ -15,7 +15,7 @@ from skyloop.messages import EventKind, LinkState, Role, Velocity
 from skyloop.metrics import FAMILIES, Reading, client_readings, proxy_readings, router_readings
 from skyloop.network import FabricServer, FabricSettings
 from skyloop.network.config import free_port
-from skyloop.network.session import Session
+from skyloop.network.session import FabricSession
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.testing import header, picture
 from tests.support.proxy_bench import Bench
@@ -145,7 +145,7 @@ def test_a_router() -> None:
     transports = [SimpleNamespace(whatami=kind) for kind in kinds]
     info = SimpleNamespace(transports=lambda: transports)
     session = SimpleNamespace(zenoh=SimpleNamespace(info=info), shut_out=lambda: frozenset({"bad"}))
-    found = values(iter(list(router_readings(lambda: cast(Session, session))())))
+    found = values(iter(list(router_readings(lambda: cast(FabricSession, session))())))
     assert found == {
         ("skyloop_router_links", "router"): 1,
         ("skyloop_router_links", "peer"): 2,

@@ -11,7 +11,7 @@ from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
-    from skyloop.network.session import Session
+    from skyloop.network.session import FabricSession
 
 
 class Found(NamedTuple):
@@ -80,7 +80,7 @@ class NetworkFinder:
         self._settings = settings
         self._wanted = wanted
         self._lock = threading.Lock()  # guards the settings and the following fields: several threads may search
-        self._session: Session | None = None
+        self._session: FabricSession | None = None
         self._known: dict[str, Found] = {}
 
     def add_name(self, name: str) -> None:
@@ -105,7 +105,7 @@ class NetworkFinder:
         if session is not None:
             release(session)
 
-    def _open(self) -> Session:
+    def _open(self) -> FabricSession:
         from skyloop.network.config import Part
         from skyloop.network.session import acquire, release
 
