@@ -17,7 +17,7 @@ from mcap.writer import CompressionType, Writer
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
 from skyloop.recording.layout import Channel, image_topic
-from skyloop.recording.pictures import Picture, decode_image
+from skyloop.recording.pictures import RecordedImage, decode_image
 from skyloop.recording.plain import Course, reported_ns, shifted
 from skyloop.recording.reader import Item, Recording
 from skyloop.recording.review.tables import tables
@@ -92,7 +92,7 @@ def test_images_are_decoded(tmp_path: Path, png: bool) -> None:
 
 def test_images_and_samples_together(flight: Path) -> None:
     found = list(Recording.open(flight).items_and_pictures("alpha", (Channel.FRAMES, Channel.EVENTS)))
-    assert sum(isinstance(one, Picture) for one in found) == 20
+    assert sum(isinstance(one, RecordedImage) for one in found) == 20
     assert {one.channel for one in found if isinstance(one, Item)} == {Channel.EVENTS}
 
 
@@ -151,7 +151,7 @@ def test_damage_only_removes_samples(
     with contextlib.suppress(FileFormatError):
         recording = Recording.open(path)
         for one in recording.items_and_pictures(recording.drone().name, tuple(Channel)):
-            if isinstance(one, Picture):
+            if isinstance(one, RecordedImage):
                 one.pixels()
 
 

@@ -27,7 +27,7 @@ from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
 from skyloop.recording.options import MB, Options, Room, judge_room
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import TranslatedImage, Translator
 from skyloop.recording.writer import FileWriter
 from tests.recording.disks import Disk
 from tests.support import recording_files as files
@@ -66,7 +66,7 @@ class Bench:
     def frames(self, *numbers: int, size: int = 1000) -> None:
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
-            picture = Picture(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
+            picture = TranslatedImage(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
 
     def pictures(self, *numbers: int, size: int = 1000, group: int = 10) -> None:
@@ -74,7 +74,7 @@ class Bench:
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
             record = FrameRecord(header, number, "h264", number % group == 0)
-            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, Picture(record, bytes(size)), size))
+            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, TranslatedImage(record, bytes(size)), size))
 
     def step(self, seconds: float = 1.0) -> None:
         """Advance by a second, after which everything is due."""

@@ -30,7 +30,7 @@ _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class RecordedImage:
     """A frame of a recording, with its image."""
 
     camera: str

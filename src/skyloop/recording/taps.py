@@ -36,7 +36,7 @@ from skyloop.platform import lower_priority
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
-from skyloop.recording.translation import Picture
+from skyloop.recording.translation import TranslatedImage
 
 _FRAMES_WAITING: Final = 2  # frames besides the one being encoded and the one arriving; a client can't hold more slots
 _SIZE: Final = 400  #: approximate size of a typical sample [bytes]
@@ -222,7 +222,7 @@ class Stream:
         header = picture.decoded(picture.width, picture.height)
         record = FrameRecord(header, now_ns, H264, picture.key)
         size = len(picture.data) + _SIZE
-        self._put(self._channel, Rank.FRAME, Picture(record, picture.data), size, now_ns)
+        self._put(self._channel, Rank.FRAME, TranslatedImage(record, picture.data), size, now_ns)
 
 
 class Video:
@@ -334,7 +334,7 @@ class Video:
 
     def _done(self, arrival: Arrival, data: bytes, format_: str) -> None:
         record = FrameRecord(arrival.header, arrival.received_ns, format_)
-        self._put(self.channel, Rank.FRAME, Picture(record, data), len(data) + _SIZE, arrival.received_ns)
+        self._put(self.channel, Rank.FRAME, TranslatedImage(record, data), len(data) + _SIZE, arrival.received_ns)
 
 
 def encoder(options: Options) -> Encode:

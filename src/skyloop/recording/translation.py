@@ -67,7 +67,7 @@ class Schema:
 
 
 @dataclass(slots=True, eq=False)
-class Picture:
+class TranslatedImage:
     """A frame as it is written to the file."""
 
     record: FrameRecord
@@ -119,7 +119,7 @@ class Translator:
             Annotation: self._annotation,
             LogEntry: self._log,
             ProcessorResult: self._result,
-            Picture: self._picture,
+            TranslatedImage: self._picture,
             Drops: self._drops,
         }
 
@@ -222,7 +222,7 @@ class Translator:
     def _drops(self, drops: Drops, log_ns: int) -> Iterator[Message]:
         yield self._own(Channel.DROPS, drops, log_ns, log_ns)
 
-    def _picture(self, picture: Picture, log_ns: int) -> Iterator[Message]:
+    def _picture(self, picture: TranslatedImage, log_ns: int) -> Iterator[Message]:
         record = picture.record
         header: FrameHeader = record.header
         drone, camera = self._drone, header.camera

@@ -24,7 +24,7 @@ from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
 from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
-from skyloop.recording.translation import Message, Picture, Schema, Translator
+from skyloop.recording.translation import Message, Schema, TranslatedImage, Translator
 
 CHUNK: Final = MB  #: a chunk is closed at this size, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog, so that receiving threads need not wake the writer
@@ -379,7 +379,7 @@ class FileWriter:
 
     def _follows(self, item: Item) -> bool:
         """Return whether a frame can be decoded using this file alone."""
-        if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
+        if not isinstance(item.sample, TranslatedImage) or item.sample.record.format != H264:
             return True
         record = item.sample.record
         chain = self._chains.setdefault((item.drone, item.channel), Chain())
@@ -510,7 +510,7 @@ class FileWriter:
 def _is_key(item: Item) -> bool:
     """Return whether a stream can be decoded starting at this frame."""
     sample = item.sample
-    return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
+    return isinstance(sample, TranslatedImage) and sample.record.format == H264 and sample.record.key
 
 
 def _why(error: OSError) -> str:

@@ -31,7 +31,7 @@ from skyloop.messages.frame import MAX_PIXELS, MAX_SCANS, image_size, why_not_de
 from skyloop.recording import scan
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import describe
-from skyloop.recording.pictures import Group, Picture, decode_image
+from skyloop.recording.pictures import Group, RecordedImage, decode_image
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import recover, summarise
@@ -315,7 +315,7 @@ def everything(path: Path, folder: Path) -> None:
     describe(path)
     name = recording.drone().name
     for one in recording.items_and_pictures(name, tuple(Channel)):
-        if isinstance(one, Picture):
+        if isinstance(one, RecordedImage):
             one.pixels()
     summarise(recording)
     for _ in ReplaySource(recording, recording.drone()).samples():

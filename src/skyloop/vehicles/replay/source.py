@@ -13,7 +13,7 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
 from skyloop.recording.layout import Channel, DroneRecord
-from skyloop.recording.pictures import Picture
+from skyloop.recording.pictures import RecordedImage
 from skyloop.recording.plain import Course, shifted
 from skyloop.recording.reader import Item, Recording
 
@@ -21,7 +21,7 @@ from skyloop.recording.reader import Item, Recording
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
 _SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: tolerance within which two clocks that were not reset advance equally
-Sample = Feedback | Picture | Event | Applied | Parameter
+Sample = Feedback | RecordedImage | Event | Applied | Parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Moment:
 
     at_ns: int
     state: Feedback | None = None  #: state when the images were captured, or the newest state if there are no images
-    pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
+    pictures: dict[str, RecordedImage] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
     parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before the moment
     following: Iterator[TimedSample] = field(default_factory=lambda: iter(()))
@@ -179,7 +179,7 @@ class ReplaySource:
                 break
             if isinstance(value, Feedback):
                 states.append(value)
-            elif isinstance(value, Picture):
+            elif isinstance(value, RecordedImage):
                 moment.pictures[value.camera] = value
             elif isinstance(value, Applied):
                 moment.command = value
@@ -192,7 +192,7 @@ class ReplaySource:
 _NEVER_NS: Final = 1 << 63  # later than any time of a sample
 
 
-def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
+def _state_of(states: Collection[Feedback], pictures: Mapping[str, RecordedImage]) -> Feedback | None:
     """Return the state when the newest image was captured, so that state and image match."""
     if not states:
         return None
