@@ -20,8 +20,8 @@ from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
 from skyloop.vehicles.msp.telemetry import PATIENCE_NS, Motion, MotionEstimate, Questions, Telemetry, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import Function, ModeRange, MspIdentity
 
 # Addresses -----------------------------------------------------------------------------------------------------------
 
@@ -73,7 +73,7 @@ def test_velocity_from_noisy_poses(rate: int) -> None:
 
 def test_an_old_pose_expires_but_its_heading_does_not() -> None:
     estimate = MotionEstimate()
-    estimate.on_attitude(msp.Attitude(0.0, 0.0, 90.0))  # east by the compass: yaw 0
+    estimate.on_attitude(msp.MspAttitude(0.0, 0.0, 90.0))  # east by the compass: yaw 0
     estimate.on_pose(pose((0.0, 0.0, 1.0), 0, yaw=1.0))
     estimate.on_pose(pose((0.0, 0.0, 1.0), NS_PER_S // 50, yaw=1.0))
     estimate.on_pose(pose((9.0, 9.0, 9.0), 0, yaw=2.0))  # older: ignored
@@ -86,7 +86,7 @@ def test_an_old_pose_expires_but_its_heading_does_not() -> None:
 
 def test_gps() -> None:
     estimate = MotionEstimate()
-    estimate.on_attitude(msp.Attitude(0.0, 0.0, 0.0))
+    estimate.on_attitude(msp.MspAttitude(0.0, 0.0, 0.0))
     estimate.on_gps(msp.Gps(True, 3, 1.0, 1.0, 0.0, 1.0, 0.0), 0)
     assert estimate.at(0).velocity_m_s is None, "three satellites are too few"
     estimate.on_gps(msp.Gps(True, 9, 47.0, 8.0, 400.0, 0.0, 0.0), 0)
@@ -104,7 +104,7 @@ def test_gps() -> None:
 # Settings ------------------------------------------------------------------------------------------------------------
 
 BOXES = ((0, "ARM"), (1, "ANGLE"), (28, "AIR MODE"), (36, "PREARM"), (50, "MSP OVERRIDE"))
-BETAFLIGHT = Identity("BTFL", (4, 6, 0), (1, 47), "SITL")
+BETAFLIGHT = MspIdentity("BTFL", (4, 6, 0), (1, 47), "SITL")
 
 
 def test_wanted_switches_are_on_and_no_others() -> None:
@@ -127,7 +127,7 @@ def test_wanted_switches_are_on_and_no_others() -> None:
 
 
 def test_inav_without_a_failsafe_is_refused() -> None:
-    inav = Identity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
+    inav = MspIdentity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
     setup = Setup(
         inav,
         BOXES,
@@ -184,40 +184,40 @@ def test_a_question_is_asked_three_times() -> None:
     questions.ask(1, answers.append)
     questions.ask(2, answers.append)
     for step in range(3):
-        assert questions.due(step * PATIENCE_NS) == Frame(1)
+        assert questions.due(step * PATIENCE_NS) == MspFrame(1)
         assert questions.due(step * PATIENCE_NS + 1) is None
-    assert questions.due(3 * PATIENCE_NS) == Frame(2)
+    assert questions.due(3 * PATIENCE_NS) == MspFrame(2)
     assert answers == [None]
-    assert not questions.on_frame(Frame(9, b"", Direction.REPLY))
-    assert questions.on_frame(Frame(2, b"", Direction.ERROR))
+    assert not questions.on_frame(MspFrame(9, b"", Direction.REPLY))
+    assert questions.on_frame(MspFrame(2, b"", Direction.ERROR))
     assert answers == [None, None]
     assert questions.idle
 
 
 def test_states_are_requested_singly_or_together() -> None:
     single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0})
-    assert single.requests(0) == [Frame(1), Frame(2)], "at most two unanswered requests"
+    assert single.requests(0) == [MspFrame(1), MspFrame(2)], "at most two unanswered requests"
     assert single.requests(1) == []
-    assert single.on_frame(Frame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
+    assert single.on_frame(MspFrame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
     assert single.unanswered == 1
-    assert single.requests(2) == [Frame(3)]
-    assert single.on_frame(Frame(3, b"", Direction.ERROR)) == [(3, None)]
+    assert single.requests(2) == [MspFrame(3)]
+    assert single.on_frame(MspFrame(3, b"", Direction.ERROR)) == [(3, None)]
     single.drop(3)
     assert all(frame.function != 3 for frame in single.requests(NS_PER_S))
     single.forget()
-    assert single.on_frame(Frame(1, b"a", Direction.REPLY)) == []
+    assert single.on_frame(MspFrame(1, b"a", Direction.REPLY)) == []
 
 
 def test_after_a_lost_answer_no_other_is_mistaken_for_it() -> None:
     together = Telemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
-    assert together.requests(0) == [Frame(Function.MULTIPLE, b"\1\2"), Frame(3)]
-    reply = Frame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
+    assert together.requests(0) == [MspFrame(Function.MULTIPLE, b"\1\2"), MspFrame(3)]
+    reply = MspFrame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
     assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
     together.requests(NS_PER_S)
     together.requests(2 * NS_PER_S)  # the answers of a second ago never came
     assert together.unanswered == 2 + 1
     assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
-    assert together.on_frame(Frame(Function.MULTIPLE, b"", Direction.ERROR)) == []
+    assert together.on_frame(MspFrame(Function.MULTIPLE, b"", Direction.ERROR)) == []
     assert together.due_ns() is not None
 
 
@@ -234,24 +234,24 @@ REPLIES = {
     Function.RX_MAP: bytes((0, 1, 3, 2)),
     Function.FAILSAFE_CONFIG: msp.FailsafeConfig(0.5, 20.0, 1000, 0.0, 1).encode(),
     Function.RC_TUNING: bytes((100, 70, 20, 20, 20, 0, 50, 0, 0, 0, 20)),
-    Function.ATTITUDE: msp.Attitude(1.0, 2.0, 45.0).encode(),
+    Function.ATTITUDE: msp.MspAttitude(1.0, 2.0, 45.0).encode(),
     Function.ALTITUDE: msp.Altitude(0.2, 0.0).encode() + bytes(4),
     Function.INAV_ANALOG: bytes.fromhex("40a0066400000000000000000000000000000000004b"),
 }
 
 
-def inav_reply(frame: Frame, flags: int) -> Frame:
+def inav_reply(frame: MspFrame, flags: int) -> MspFrame:
     status = bytes.fromhex("f401000063000500") + b"\x10" + flags.to_bytes(4, "little") + bytes((3, 0, 0, 0, 0, 0, 0, 0))
     settings = {b"receiver_type\0": b"\2", b"max_angle_inclination_rll\0": (300).to_bytes(2, "little")}
     if frame.function == Function.INAV_STATUS:
-        return Frame(frame.function, status, Direction.REPLY)
+        return MspFrame(frame.function, status, Direction.REPLY)
     if frame.function == Function.COMMON_SETTING:
-        return Frame(frame.function, settings[frame.payload], Direction.REPLY)
+        return MspFrame(frame.function, settings[frame.payload], Direction.REPLY)
     if frame.function == Function.SET_RAW_RC:
-        return Frame(frame.function, b"", Direction.REPLY)
+        return MspFrame(frame.function, b"", Direction.REPLY)
     if frame.function in REPLIES:
-        return Frame(frame.function, REPLIES[Function(frame.function)], Direction.REPLY)
-    return Frame(frame.function, b"", Direction.ERROR)
+        return MspFrame(frame.function, REPLIES[Function(frame.function)], Direction.REPLY)
+    return MspFrame(frame.function, b"", Direction.ERROR)
 
 
 def test_inav_is_identified_and_armed() -> None:

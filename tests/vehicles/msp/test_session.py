@@ -17,7 +17,7 @@ from skyloop.vehicles.msp.emulator import EMPTY_WRITES, BoardSettings, bit
 from skyloop.vehicles.msp.firmware import Setup
 from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
 from skyloop.vehicles.msp.telemetry import Motion
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
 from tests.vehicles.msp.bench import TICK_S, Bench, options
 
@@ -308,7 +308,7 @@ def test_other_firmware_is_not_flown() -> None:
     identity = ((1, b"\0\1\x2a"), (2, b"CLFL"), (3, b"\2\6\0"), (4, b"ABCD"))
     for function, payload in ((101, bytes(20)), *identity, (101, bytes(20))):
         bench.session.poll(now_ns)
-        bench.session.receive(encode(Frame(function, payload, Direction.REPLY)), now_ns)
+        bench.session.receive(encode(MspFrame(function, payload, Direction.REPLY)), now_ns)
     for publish in bench.session.drain():
         publish(bench.sink)
     assert bench.sink.link_state is LinkState.DEGRADED
@@ -823,8 +823,8 @@ def test_a_vehicle_that_has_just_started_says_what_it_waits_for() -> None:
 def test_an_empty_write_is_acknowledged_as_by_a_real_one_without_effect(number: int) -> None:
     """A configurator's write was reported as refused. Compared with Betaflight 4.6.0 SITL."""
     bench = Bench()
-    reply = bench.board.answer(Frame(number, b""), bench.clock.now_ns)
-    assert reply == Frame(number, b"", Direction.REPLY)
-    written = bench.board.answer(Frame(number, b"\0"), bench.clock.now_ns)
+    reply = bench.board.answer(MspFrame(number, b""), bench.clock.now_ns)
+    assert reply == MspFrame(number, b"", Direction.REPLY)
+    written = bench.board.answer(MspFrame(number, b"\0"), bench.clock.now_ns)
     assert written is not None
     assert written.direction is Direction.ERROR, "the written value is not kept"

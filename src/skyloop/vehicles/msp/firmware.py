@@ -28,7 +28,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     rate_curve,
     share_of,
 )
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Identity, ModeRange
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, ModeRange, MspIdentity
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
@@ -49,7 +49,7 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 class Setup:
     """A flight controller's settings; a setting that was not reported is None."""
 
-    identity: Identity = field(default_factory=Identity)
+    identity: MspIdentity = field(default_factory=MspIdentity)
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle

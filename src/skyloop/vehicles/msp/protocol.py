@@ -27,7 +27,7 @@ from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, MspSetpoints, Phas
 from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
 DEGRADED_NS: Final = nanoseconds(0.4)  #: time without data after which the link counts as degraded
@@ -152,7 +152,7 @@ class MspSession(VehicleSession):
             if frame.direction is not Direction.REQUEST:
                 self._on_frame(frame, now_ns)
 
-    def _on_frame(self, frame: Frame, now_ns: int) -> None:
+    def _on_frame(self, frame: MspFrame, now_ns: int) -> None:
         begins, self._received_ns = self._received_ns is None, now_ns
         self._unreachable = ""
         if begins:
@@ -179,7 +179,7 @@ class MspSession(VehicleSession):
     def _on_state(self, function: int, payload: bytes, now_ns: int) -> None:
         reported = self.reported
         if function == Function.ATTITUDE:
-            reported.attitude = msp.Attitude.decode(payload)
+            reported.attitude = msp.MspAttitude.decode(payload)
             self.motion.on_attitude(reported.attitude)
             self._publish(now_ns)
         elif function == Function.ALTITUDE:
@@ -187,9 +187,9 @@ class MspSession(VehicleSession):
             if reported.status is None or _has_height(reported.status):
                 self.motion.on_altitude(reported.altitude, now_ns)
         elif function in (Function.STATUS_EX, Function.STATUS):
-            self._on_status(msp.Status.of_betaflight(payload), now_ns)
+            self._on_status(msp.MspStatus.of_betaflight(payload), now_ns)
         elif function == Function.INAV_STATUS:
-            self._on_status(msp.Status.of_inav(payload), now_ns)
+            self._on_status(msp.MspStatus.of_inav(payload), now_ns)
         elif function == Function.RAW_GPS:
             self.motion.on_gps(msp.Gps.decode(payload), now_ns)
         elif function == Function.BATTERY_STATE:
@@ -199,7 +199,7 @@ class MspSession(VehicleSession):
         elif function == Function.RC:
             self._on_pilot(msp.channels(payload), now_ns)
 
-    def _on_status(self, status: msp.Status, now_ns: int) -> None:
+    def _on_status(self, status: msp.MspStatus, now_ns: int) -> None:
         assert self.setup is not None
         self.reported.status = status
         variant = self.setup.identity.variant
@@ -362,7 +362,7 @@ class MspSession(VehicleSession):
         return urgent
 
     def _stick_frame(self, now_ns: int) -> bytes:
-        return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
+        return encode(MspFrame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
 
     def _count(self, now_ns: int) -> None:
         """Measure the rate of acknowledged stick frames."""
@@ -491,7 +491,7 @@ def _known_settings(setup: Setup) -> tuple[bool, bool]:
     return bool(setup.arm_ranges), setup.sticks_known
 
 
-def _has_height(status: msp.Status) -> bool:
+def _has_height(status: msp.MspStatus) -> bool:
     return any(status.has(sensor) for sensor in (Sensor.BAROMETER, Sensor.GPS, Sensor.RANGEFINDER))
 
 
