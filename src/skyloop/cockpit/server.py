@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.cockpit.addresses import bind, host_names, own_addresses, reachable
-from skyloop.cockpit.listening import Admission, Connection, Listener, ProtocolFactory, limit_messages, places_here
+from skyloop.cockpit.listening import Acceptor, Admission, Connection, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
 from skyloop.metrics import client_readings
@@ -172,7 +172,7 @@ def serve_cockpit(
         server = quiet_server(app)
         seen_at = reachable(address)[0]
         page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
-        listener = Listener(listening, admission, http_protocol(server, admission), tls)
+        acceptor = Acceptor(listening, admission, http_protocol(server, admission), tls)
         if metrics is not None:
             from skyloop.metrics import serve
 
@@ -180,7 +180,7 @@ def serve_cockpit(
             print(endpoint.announcement, file=sys.stderr, flush=True)
         expire_codes = pairing.expire if pairing is not None else lambda: None
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: ready(page + code), stop, expire_codes))
+        asyncio.run(_run(server, acceptor, lambda: ready(page + code), stop, expire_codes))
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
@@ -348,7 +348,7 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
 
 async def _run(
     server: uvicorn.Server,
-    listener: Listener,
+    acceptor: Acceptor,
     on_ready: Callable[[], None],
     stop: threading.Event | None,
     expire_codes: Callable[[], None],
@@ -359,7 +359,7 @@ async def _run(
     serving = asyncio.create_task(server.serve(sockets=[]))
     while not server.started and not serving.done():
         await asyncio.sleep(_POLL_S / 10)
-    listening = asyncio.create_task(listener.run())
+    listening = asyncio.create_task(acceptor.run())
     await asyncio.sleep(0)  # the first step of the event loop starts listening
     if not serving.done():
         on_ready()
@@ -372,7 +372,7 @@ async def _run(
     await asyncio.gather(listening, return_exceptions=True)
     await serving
     if not listening.cancelled():
-        await listening  # raises the error that ended the listener
+        await listening  # raises the error that ended the acceptor
 
 
 def fleet_sources(fleet: Fleet) -> list[Source]:
