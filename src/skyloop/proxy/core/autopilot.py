@@ -113,7 +113,7 @@ _STATES: Final = {
 }
 
 
-class Autopilot:
+class SoftwareAutopilot:
     """Flies one vehicle in software. ``flight`` is informed of the current task and decides when the task has ended."""
 
     def __init__(

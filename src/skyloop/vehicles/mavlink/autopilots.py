@@ -22,7 +22,7 @@ from skyloop.vehicles.mavlink.telemetry import (
     Telemetry,
     VehicleState,
 )
-from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Landed, MavAutopilot, copter_mode, px4_mode
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error
@@ -336,8 +336,8 @@ def copter_speed(values: Values, which: str, usual_m_s: float) -> float:
 
 def profile_of(autopilot: int) -> AutopilotProfile | None:
     """Return the profile for a heartbeat's ``MAV_AUTOPILOT``; None for an unknown one."""
-    if autopilot == Autopilot.ARDUPILOT:
+    if autopilot == MavAutopilot.ARDUPILOT:
         return ArduCopterProfile()
-    if autopilot == Autopilot.PX4:
+    if autopilot == MavAutopilot.PX4:
         return Px4Profile()
     return None

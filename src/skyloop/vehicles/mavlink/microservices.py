@@ -17,7 +17,7 @@ from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.options import Peer, PoseMessage
 from skyloop.vehicles.mavlink.telemetry import Telemetry
 from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
+from skyloop.vehicles.mavlink.wire.codec import MavAutopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
@@ -128,7 +128,7 @@ def _is_vehicle(heartbeat: Message) -> bool:
 
 def unsupported_reason(heartbeat: Message) -> str:
     """Return why Skyloop can't fly this vehicle; empty if it can."""
-    if heartbeat.autopilot not in tuple(Autopilot):
+    if heartbeat.autopilot not in tuple(MavAutopilot):
         return f"its MAV_AUTOPILOT is {heartbeat.autopilot}; only ArduCopter and PX4 are supported"
     if heartbeat.type not in _MULTIROTORS:
         return f"its MAV_TYPE is {heartbeat.type}, not a multirotor or helicopter"

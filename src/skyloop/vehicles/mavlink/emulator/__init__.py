@@ -31,10 +31,10 @@ from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, Runni
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
 from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
-from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
+from skyloop.vehicles.mavlink.emulator.autopilot import EmulatedAutopilot
 from skyloop.vehicles.mavlink.emulator.links import (
     Kind,
-    MavlinkEmulatorSettings,
+    MavlinkSettings,
     Port,
     Ports,
     Streams,
@@ -51,13 +51,13 @@ if TYPE_CHECKING:
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]
 
 
-_KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
+_KINDS: dict[Kind, type[EmulatedAutopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
 
 
 class RunningFirmware(RunningEmulator):
     """An autopilot that is switched on. Use it only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: MavlinkEmulatorSettings, loop: Loop | None) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: MavlinkSettings, loop: Loop | None) -> None:
         super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
@@ -149,9 +149,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         self._loop = loop
         delay_s = checked_delay(delay_s)
         ports = ports or Ports.standard(kind, drone)
-        self.settings = MavlinkEmulatorSettings(
-            kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video
-        )
+        self.settings = MavlinkSettings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
@@ -159,7 +157,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         return running
 
     @property
-    def autopilot(self) -> Autopilot:
+    def autopilot(self) -> EmulatedAutopilot:
         """The running autopilot, for tests. Use it only on the loop's thread."""
         return self._started.autopilot
 

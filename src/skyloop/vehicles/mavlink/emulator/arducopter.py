@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, EmulatedAutopilot, Result, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -27,7 +27,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 from skyloop.vehicles.mavlink.emulator.services import Mission, MissionResult, ParameterTable, mission_ack
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
 from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, Message
-from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import EmulatedAutopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
@@ -45,7 +45,7 @@ _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 
 
-class ArduCopter(Autopilot):
+class ArduCopter(EmulatedAutopilot):
     """An emulated ArduCopter."""
 
     AUTOPILOT = Number.ARDUPILOT

@@ -53,7 +53,7 @@ class Result(IntEnum):
     FAILED = 4
 
 
-class Autopilot(AutopilotState):
+class EmulatedAutopilot(AutopilotState):
     """One autopilot. Call all its methods on one thread. Set ``ports`` (its links) before the first report."""
 
     CAPABILITIES: ClassVar[int]

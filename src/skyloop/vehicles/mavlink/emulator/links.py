@@ -92,7 +92,7 @@ def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPO
 
 
 @dataclass(frozen=True, slots=True)
-class MavlinkEmulatorSettings:
+class MavlinkSettings:
     """The arguments passed to :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
 
     kind: Kind
@@ -174,14 +174,14 @@ class Port(Protocol):
     def close(self) -> None: ...
 
 
-def _codec(settings: MavlinkEmulatorSettings) -> Codec:
+def _codec(settings: MavlinkSettings) -> Codec:
     return Codec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
 
 
 class UdpPort:
     """A UDP port that sends to the remote port until a message arrives, then to that message's sender."""
 
-    def __init__(self, loop: Loop, settings: MavlinkEmulatorSettings, streams: Streams, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message
@@ -222,7 +222,7 @@ class UdpPort:
 class TcpPort:
     """A TCP server for one client at a time. The next client waits in the kernel's backlog, receiving nothing."""
 
-    def __init__(self, loop: Loop, settings: MavlinkEmulatorSettings, streams: Streams, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message

@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 from skyloop.vehicles.emulation.flight import USUAL, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, EmulatedAutopilot, Result, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -23,7 +23,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
 from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
-from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import EmulatedAutopilot as Number
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate in stick modes if there is no remote control
@@ -34,7 +34,7 @@ LIFTS_OFF_AT: Final = 0.2  #: throttle at which the vehicle lifts off, as a frac
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 
 
-class Px4(Autopilot):
+class Px4(EmulatedAutopilot):
     """An emulated PX4."""
 
     AUTOPILOT = Number.PX4

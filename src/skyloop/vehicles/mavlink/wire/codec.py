@@ -359,7 +359,7 @@ def to_field(value: float, kind: int, *, bytewise: bool) -> float:
 # Modes ---------------------------------------------------------------------------------------------------------------
 
 
-class Autopilot(IntEnum):
+class MavAutopilot(IntEnum):
     """The supported ``MAV_AUTOPILOT`` values."""
 
     ARDUPILOT = 3
