@@ -40,7 +40,7 @@ from skyloop.vehicles.sim.options import firmware_options, options_of
 from skyloop.vehicles.sim.telemetry import feedback_of
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera
+    from skyloop.sim.camera_pipeline import PipelineCamera
     from skyloop.vehicles.sim.firmware_flight import FirmwareFlight
 
 _OCCURRENCES: Final = {
@@ -85,7 +85,7 @@ class SimDriver(Driver):
         self._battery = self.options.battery
         self._link = True
         self._setpoints: SimSetpoints | None = None
-        self._cameras: tuple[Camera, ...] = ()
+        self._cameras: tuple[PipelineCamera, ...] = ()
         self._world: World | None = None
         self._firmware: FirmwareFlight | None = None  # None if the built-in autopilot flies the drone
         if self.options.autopilot is not None:

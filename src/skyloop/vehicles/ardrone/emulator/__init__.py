@@ -48,7 +48,7 @@ from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding, require_encoder
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera
+    from skyloop.sim.camera_pipeline import PipelineCamera
 
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]
 
@@ -65,7 +65,7 @@ def with_ardrones(options: SimOptions | None = None) -> SimOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class ArdroneEmulatorSettings:
+class ArdroneSettings:
     """The arguments passed to :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
 
     version: int
@@ -243,7 +243,7 @@ DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 class RunningFirmware(RunningEmulator):
     """An AR.Drone that is switched on. Use its logic, ports and lists of clients only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: ArdroneEmulatorSettings) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: ArdroneSettings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
@@ -255,7 +255,7 @@ class RunningFirmware(RunningEmulator):
         self.logic = ArdroneLogic(vehicle, self._send_text, monotonic_ns, version=settings.version)
         self._shown = self.logic.video
         self._video = self._encoding = VideoEncoding(self._packer(), lambda: self._shown, self._encoded)
-        self._cameras: tuple[Camera, ...] = ()
+        self._cameras: tuple[PipelineCamera, ...] = ()
         try:
             self._open_ports(settings.ports)
             self._encoding.start()
@@ -455,9 +455,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         if version > 1:
             require_encoder()
         super().__init__(host, drone)
-        self.settings = ArdroneEmulatorSettings(
-            version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start
-        )
+        self.settings = ArdroneSettings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)
