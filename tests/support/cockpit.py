@@ -17,7 +17,7 @@ import numpy as np
 
 from skyloop.client import Authority, Drone
 from skyloop.client.drone import open_drone
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
 from skyloop.cockpit.alarms import PARAMETERS, USUAL
@@ -195,7 +195,7 @@ class FakeDrone:
         self._seq += 1
         now = time.monotonic_ns()
         header = FrameHeader(camera, self._seq, captured_ns or now, now, width, height, Encoding.BGR8, pixels.size)
-        frame = Arrival(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
+        frame = ReceivedFrame(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
         for function in list(self.processors[camera]):
             function(frame)
         return frame

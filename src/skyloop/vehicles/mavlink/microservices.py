@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.clock import LiveClock, nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
+from skyloop.drivers.vehicle_session import PacketOrder, RestartWatch, VehicleEvent
 from skyloop.drivers.vehicle_session import message as event_of
 from skyloop.messages import Severity
 from skyloop.messages.geometry import quaternion_from_euler
@@ -281,7 +281,7 @@ class VehicleClock:
             self.round_trip_s = seconds(best_ns)
         return []
 
-    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
+    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> PacketOrder:
         """Classify a message by its stamp as new, older than others of its kind, or sent after a reboot."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 

@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.vehicle_session import (
-    Arrival,
     LinkTimeouts,
     LinkTrouble,
     MotorStop,
+    PacketOrder,
     VehicleEvent,
     VehicleSession,
     serial_trouble,
@@ -242,11 +242,11 @@ class MavlinkSession(VehicleSession):
             return
         if kind in _STAMPED:
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
-            if arrival is Arrival.RESTARTED:
+            if arrival is PacketOrder.RESTARTED:
                 self.version = None  # a different vehicle with other parameters may be answering
                 self.telemetry = Telemetry()
                 self._lose("the vehicle rebooted", now_ns)
-            if arrival is not Arrival.NEW:
+            if arrival is not PacketOrder.NEW:
                 return
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)

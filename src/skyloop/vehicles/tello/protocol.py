@@ -10,8 +10,8 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.drivers.vehicle_session import (
     KEPT_NS,
-    Arrival,
     LinkTimeouts,
+    PacketOrder,
     RestartWatch,
     VehicleEvent,
     VehicleSession,
@@ -231,7 +231,7 @@ class TelloSession(VehicleSession):
         except DecodeError:
             self.counts["damaged"] += 1
             return
-        if state.motor_s is not None and self._watch.update(state.motor_s, now_ns) is Arrival.LATE:
+        if state.motor_s is not None and self._watch.update(state.motor_s, now_ns) is PacketOrder.LATE:
             self.counts["late"] += 1
             return
         self.counts["received"] += 1
