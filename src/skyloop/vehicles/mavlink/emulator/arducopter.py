@@ -26,8 +26,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import Mission, MissionResult, ParameterTable, mission_ack
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, Message
-from skyloop.vehicles.mavlink.wire.codec import EmulatedAutopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, MavAutopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
@@ -48,7 +47,7 @@ _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 class ArduCopter(EmulatedAutopilot):
     """An emulated ArduCopter."""
 
-    AUTOPILOT = Number.ARDUPILOT
+    AUTOPILOT = MavAutopilot.ARDUPILOT
     CAPABILITIES = 0xFBEF & ~0xD200  # excluding fences, rally points, terrain and files, which are not emulated
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}

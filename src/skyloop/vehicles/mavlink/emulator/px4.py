@@ -22,8 +22,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
-from skyloop.vehicles.mavlink.wire.codec import EmulatedAutopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, MavAutopilot, Message, px4_custom
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate in stick modes if there is no remote control
@@ -37,7 +36,7 @@ _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 class Px4(EmulatedAutopilot):
     """An emulated PX4."""
 
-    AUTOPILOT = Number.PX4
+    AUTOPILOT = MavAutopilot.PX4
     CAPABILITIES = 0xE8FF & ~0xC025  # excluding files, missions, fences and rally points, which are not emulated
     VERSION = 1 << 24 | 17 << 16
     RATES: ClassVar[dict[int, float]] = {
