@@ -100,7 +100,7 @@ def test_a_vehicle_that_knows_its_position(rig: Rig) -> None:
     from skyloop.messages import Feedback, LinkState
     from skyloop.messages.feedback import EarthOrigin
     from skyloop.ros.names import RosTime
-    from skyloop.ros.telemetry import Telemetry
+    from skyloop.ros.telemetry import RosTelemetry
 
     quiet = SimpleNamespace(
         on_feedback=lambda function: None,
@@ -108,7 +108,7 @@ def test_a_vehicle_that_knows_its_position(rig: Rig) -> None:
         capabilities=SimpleNamespace(cameras=()),
     )
     node: Any = Node("one", "", [])
-    telemetry = Telemetry(node, quiet, RosTime(node, quiet), Frames("one"))  # type: ignore[arg-type]
+    telemetry = RosTelemetry(node, quiet, RosTime(node, quiet), Frames("one"))  # type: ignore[arg-type]
     known = Feedback(
         captured_ns=4 * 10**9,
         state=FlightState.FLYING,

@@ -15,7 +15,7 @@ from skyloop.extend import open_unasked
 from skyloop.messages import Event, Severity
 from skyloop.ros.names import Frames, RosTime, namespaces_of
 from skyloop.ros.pilot import Parameters, Pilot
-from skyloop.ros.telemetry import CameraPublisher, Telemetry
+from skyloop.ros.telemetry import CameraPublisher, RosTelemetry
 from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
 
 PURPOSE: Final = "the bridge to ROS 2"
@@ -115,7 +115,7 @@ class Bridge:
         drone.on_event(lambda event: _log(node, event))
         frames, time = Frames(namespace, settings.map_frame), RosTime(node, drone)
         Parameters(node, drone)
-        Telemetry(node, drone, time, frames)
+        RosTelemetry(node, drone, time, frames)
         self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
         pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
         self._stack.callback(pilot.close)  # close the pilot before disconnecting, because disconnecting lands the drone

@@ -32,7 +32,7 @@ _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 JPEG_QUALITY: Final = 90  #: on OpenCV's scale, 0 to 100
 
 
-class Telemetry:
+class RosTelemetry:
     """Publishes each feedback sample on the topics that have subscribers."""
 
     def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:

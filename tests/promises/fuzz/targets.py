@@ -108,10 +108,10 @@ def tello(data: bytes) -> None:
 
 def mavlink(data: bytes) -> None:
     """The data of a MAVLink vehicle: in one datagram, as a stream, and as a stream cut into datagrams."""
-    from skyloop.vehicles.mavlink.wire.codec import Codec
+    from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec
 
-    Codec(1, 1).decode(data, whole=True)
-    stream, cut, signed = Codec(1, 1), Codec(1, 1), Codec(1, 1, key=bytes(32))
+    MavlinkCodec(1, 1).decode(data, whole=True)
+    stream, cut, signed = MavlinkCodec(1, 1), MavlinkCodec(1, 1), MavlinkCodec(1, 1, key=bytes(32))
     for number, part in enumerate(_parts(data)):
         stream.decode(part)
         cut.decode(part, whole=True, source=number % 3)

@@ -18,7 +18,7 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.msp.emulator import RACER, Board, BoardSettings
+from skyloop.vehicles.msp.emulator import RACER, BoardSettings, EmulatedBoard
 from skyloop.vehicles.msp.parameters import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession
 from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
@@ -51,7 +51,7 @@ class Bench:
         world = replace(load_world("empty", 0), targets=())
         self.simulation = Simulation(world, seed=1, parameters=BATTERY_FREE)
         self.clock = ManualClock(100 * NS_PER_S)
-        self.board = Board(SimulatedVehicle(self.simulation, 0), settings or BoardSettings(), self.clock.now_ns)
+        self.board = EmulatedBoard(SimulatedVehicle(self.simulation, 0), settings or BoardSettings(), self.clock.now_ns)
         self.sink = RecordingSink()
         self.poses = poses
         self.cut = self.deaf = False

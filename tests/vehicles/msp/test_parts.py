@@ -14,11 +14,11 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
-from skyloop.vehicles.msp.firmware import Setup, hindrances
+from skyloop.vehicles.msp.firmware import MspSetup, hindrances
 from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
-from skyloop.vehicles.msp.telemetry import PATIENCE_NS, Motion, MotionEstimate, Questions, Telemetry, charge_left
+from skyloop.vehicles.msp.setpoints import MspReport, MspSetpoints, Phase
+from skyloop.vehicles.msp.telemetry import PATIENCE_NS, MotionEstimate, MspMotion, MspTelemetry, Questions, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import Function, ModeRange, MspIdentity
@@ -108,7 +108,7 @@ BETAFLIGHT = MspIdentity("BTFL", (4, 6, 0), (1, 47), "SITL")
 
 
 def test_wanted_switches_are_on_and_no_others() -> None:
-    setup = Setup(
+    setup = MspSetup(
         BETAFLIGHT,
         BOXES,
         (
@@ -128,7 +128,7 @@ def test_wanted_switches_are_on_and_no_others() -> None:
 
 def test_inav_without_a_failsafe_is_refused() -> None:
     inav = MspIdentity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
-    setup = Setup(
+    setup = MspSetup(
         inav,
         BOXES,
         (ModeRange(0, 0, 1700, 2100), ModeRange(1, 1, 900, 2100)),
@@ -137,7 +137,7 @@ def test_inav_without_a_failsafe_is_refused() -> None:
     )
     assert "it does nothing" in hindrances(setup.diagnose(override=False))
     assert str(inav) == "INAV 8.0.0 on MATEKF405"
-    unknown = Setup(inav, BOXES, setup.ranges, receiver_is_msp=False)
+    unknown = MspSetup(inav, BOXES, setup.ranges, receiver_is_msp=False)
     told = hindrances(unknown.diagnose(override=False))
     assert "sticks do not arrive by MSP" in told
     assert "failsafe is unknown" in told
@@ -195,7 +195,7 @@ def test_a_question_is_asked_three_times() -> None:
 
 
 def test_states_are_requested_singly_or_together() -> None:
-    single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0})
+    single = MspTelemetry({1: 50.0, 2: 50.0, 3: 50.0})
     assert single.requests(0) == [MspFrame(1), MspFrame(2)], "at most two unanswered requests"
     assert single.requests(1) == []
     assert single.on_frame(MspFrame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
@@ -209,7 +209,7 @@ def test_states_are_requested_singly_or_together() -> None:
 
 
 def test_after_a_lost_answer_no_other_is_mistaken_for_it() -> None:
-    together = Telemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
+    together = MspTelemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
     assert together.requests(0) == [MspFrame(Function.MULTIPLE, b"\1\2"), MspFrame(3)]
     reply = MspFrame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
     assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
@@ -300,7 +300,7 @@ def test_a_pilot_hands_over_the_sticks_and_takes_them_back() -> None:
     setpoints = given_away()
     assert setpoints.left_to == ""
     assert setpoints.channels(NS_PER_S // 50)[2] == pytest.approx(1420, abs=2), "nothing jumps"
-    setpoints.on_report(Report(armed=True), 2)
+    setpoints.on_report(MspReport(armed=True), 2)
     assert setpoints.left_to == "RECEIVER"
     assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
     with pytest.raises(DriverError, match="at the pilot's receiver"):
@@ -317,7 +317,7 @@ def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_rese
         nonlocal now_ns
         for _ in range(round(seconds / 0.02)):
             now_ns += NS_PER_S // 50
-            setpoints.on_report(Report(armed=True, overridden=overridden), now_ns)
+            setpoints.on_report(MspReport(armed=True, overridden=overridden), now_ns)
             if not overridden:
                 setpoints.on_pilot_throttle(0.42)
             setpoints.step_stop(now_ns)
@@ -338,14 +338,14 @@ def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_rese
 def given_away() -> MspSetpoints:
     """Return a controller after a pilot flew by receiver at a throttle of 0.42 and handed over the sticks."""
     setpoints = MspSetpoints(override=True)
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
-    setpoints.on_report(Report(armed=True), 0)
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
+    setpoints.on_report(MspReport(armed=True), 0)
     assert setpoints.left_to == "RECEIVER"
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
     setpoints.on_pilot_throttle(0.42)
-    setpoints.on_report(Report(armed=True, overridden=True), 1)
+    setpoints.on_report(MspReport(armed=True, overridden=True), 1)
     return setpoints
 
 
@@ -353,18 +353,18 @@ def given_away() -> MspSetpoints:
 def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(climbs: bool) -> None:
     """It tipped over, or a switch killed it: 20 ms later the software take-off armed it again."""
     setpoints = MspSetpoints()
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     setpoints.receiving = True
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(0.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
-    setpoints.on_report(Report(armed=False), 0)
+    setpoints.on_report(MspReport(armed=False), 0)
     assert setpoints.ask_takeoff(1) == ""
     setpoints.apply(Attitude(climb=0.5), 1)
-    setpoints.on_report(Report(armed=True), 2)
+    setpoints.on_report(MspReport(armed=True), 2)
     if climbs:
         setpoints.phase = Phase.FLYING
-    setpoints.on_report(Report(armed=False), 3)
+    setpoints.on_report(MspReport(armed=False), 3)
     with pytest.raises(DriverError, match="disarmed"):
         setpoints.apply(Attitude(climb=0.5), 4)
     assert setpoints.phase is Phase.STANDING
@@ -373,7 +373,7 @@ def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(
 def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_landing() -> None:
     """A simulated world ran slower than the firmware's clock: its motors were stopped at 1.6 m, without an event."""
     setpoints, now_ns = MspSetpoints(), 0
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     setpoints.receiving, setpoints.phase, setpoints.hover = True, Phase.FLYING, 0.4
 
     def descend(climb: float, height: float, time_s: float) -> Phase:
@@ -381,7 +381,7 @@ def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_
         setpoints.apply(Attitude(climb=-0.5), now_ns)
         for _ in range(round(time_s / 0.02)):
             now_ns += 20_000_000
-            setpoints.on_motion(Motion(climb_m_s=climb, height_m=height, precise=True))
+            setpoints.on_motion(MspMotion(climb_m_s=climb, height_m=height, precise=True))
             setpoints.channels(now_ns)
         return setpoints.phase
 
@@ -400,15 +400,15 @@ def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_
 def test_a_vehicle_found_again_disarmed_can_take_off_at_once() -> None:
     """Its firmware restarted in flight: the earlier take-off is over, and none continues."""
     setpoints = MspSetpoints()
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
-    setpoints.on_report(Report(armed=True), 1)
+    setpoints.on_report(MspReport(armed=True), 1)
     setpoints.phase = Phase.FLYING
     setpoints.lost()
     setpoints.on_motion(estimate.at(2))
-    setpoints.on_report(Report(armed=False), 3)
+    setpoints.on_report(MspReport(armed=False), 3)
     assert setpoints.phase is Phase.STANDING
     assert setpoints.ask_takeoff(4) == ""
 

@@ -14,9 +14,9 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
 from skyloop.vehicles.msp.emulator import EMPTY_WRITES, BoardSettings, bit
-from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.setpoints import MspSetpoints, Phase, Report
-from skyloop.vehicles.msp.telemetry import Motion
+from skyloop.vehicles.msp.firmware import MspSetup
+from skyloop.vehicles.msp.setpoints import MspReport, MspSetpoints, Phase
+from skyloop.vehicles.msp.telemetry import MspMotion
 from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
 from tests.vehicles.msp.bench import TICK_S, Bench, options
@@ -111,13 +111,13 @@ SEEDS = 20
 def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[MspSetpoints, list[float]]:
     """Return a vehicle asked to sink at 0.4 m/s, and its throttle as a share of the hover throttle."""
     setpoints, chance, now_ns, shares = MspSetpoints(), random.Random(seed), NS_PER_S, []
-    setpoints.on_report(Report(True), now_ns)
+    setpoints.on_report(MspReport(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     setpoints.apply(Attitude(climb=-0.4), now_ns)
     for tick in range(round(seconds / 0.02)):
         now_ns += NS_PER_S // 50
         true = climb if tick > 50 else -0.4
-        setpoints.on_motion(Motion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
+        setpoints.on_motion(MspMotion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
         setpoints.channels(now_ns)
         if setpoints.phase is Phase.STANDING:
             break
@@ -649,10 +649,10 @@ def test_no_stop_arms_a_vehicle_with_unknown_state_and_mode_names(silent: Functi
 def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -> None:
     """The centre of roll may be half throttle; a stop without an arm switch was sent as such."""
     setpoints = MspSetpoints()
-    setpoints.on_report(Report(True), 10**9)
+    setpoints.on_report(MspReport(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)
     assert setpoints.channels(10**9)[:4] == [1000] * 4
-    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_known=True), "")
+    setpoints.set_up(MspSetup(sticks=(1, 2, 3, 0), sticks_known=True), "")
     assert setpoints.channels(10**9)[:4] == [1000, 1500, 1500, 1500]
 
 
@@ -681,14 +681,14 @@ def test_a_stop_while_a_flying_vehicle_is_found_is_not_undone_by_adopting_it() -
 def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() -> None:
     """Neither during the stop nor after it has expired: else no pilot would look at it, or land it, any more."""
     setpoints, now_ns = MspSetpoints(), 10**9
-    setpoints.on_report(Report(True), now_ns)
+    setpoints.on_report(MspReport(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     assert setpoints.flight_state() is FlightState.FLYING
     setpoints.apply(EmergencyStop(), now_ns)
     told = set()
     for _ in range(120):
         now_ns += 10**8
-        setpoints.on_report(Report(True), now_ns)
+        setpoints.on_report(MspReport(True), now_ns)
         setpoints.step_stop(now_ns)
         told.add(setpoints.flight_state())
     assert [event.data["reason"] for event in setpoints.pop_events()] == ["stop_given_up"]
@@ -700,7 +700,7 @@ def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() ->
         assert "still armed" in setpoints.ask_takeoff(now_ns)
         assert setpoints.channels(now_ns)[:4].count(1000) == 1, "no throttle"
         setpoints.lost()
-    setpoints.on_report(Report(False), now_ns)
+    setpoints.on_report(MspReport(False), now_ns)
     assert setpoints.flight_state() is FlightState.LANDED
     setpoints.apply(ResetEmergency(), now_ns)
     assert "still armed" not in setpoints.ask_takeoff(now_ns)

@@ -96,7 +96,7 @@ class Reception:
         return True
 
 
-class DroneClock:
+class NavdataClock:
     """Determines the capture time of a datagram's state on this host's clock.
 
     This is the stamp in the option ``time``, taking the smallest recent delay as zero, or without that option the
@@ -289,7 +289,7 @@ def emergency_reason(state: State) -> str:
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 
-class Health:
+class ArdroneHealth:
     """Reports each change in the drone's health bits once."""
 
     def __init__(self) -> None:

@@ -15,7 +15,7 @@ from skyloop.drivers.vehicle_session import message as event_of
 from skyloop.messages import Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.options import Peer, PoseMessage
-from skyloop.vehicles.mavlink.telemetry import Telemetry
+from skyloop.vehicles.mavlink.telemetry import MavlinkTelemetry
 from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import MavAutopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
@@ -154,7 +154,7 @@ def result_name(result: int) -> str:
     return _RESULTS[result] if 0 <= result < len(_RESULTS) else f"result {result}"
 
 
-class CommandSender:
+class MavlinkCommandSender:
     """Sends commands and stores their results.
 
     Level-triggered: to achieve an effect, a caller keeps calling :meth:`request` until the effect is visible.
@@ -215,7 +215,7 @@ class MessageIntervals:
         self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at that time, number of requests
         self._check_ns = 0
 
-    def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
+    def request_missing(self, telemetry: MavlinkTelemetry, commands: MavlinkCommandSender, now_ns: int) -> None:
         """Request up to :data:`AT_ONCE` messages that are missing or too slow."""
         if now_ns < self._check_ns:
             return

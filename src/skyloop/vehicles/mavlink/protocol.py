@@ -24,7 +24,7 @@ from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, I
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, profile_of
 from skyloop.vehicles.mavlink.microservices import (
-    CommandSender,
+    MavlinkCommandSender,
     MessageIntervals,
     VehicleClock,
     VehicleCommand,
@@ -35,9 +35,9 @@ from skyloop.vehicles.mavlink.microservices import (
 from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
 from skyloop.vehicles.mavlink.parameters import ParameterExchange
 from skyloop.vehicles.mavlink.setpoints import CUT, MavlinkSetpoints
-from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.vehicles.mavlink.telemetry import HealthMonitor, MavlinkTelemetry, VehicleState, feedback_of
 from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
-from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
@@ -100,10 +100,10 @@ class MavlinkSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
-        self.telemetry = Telemetry()
+        self.codec = MavlinkCodec(options.own_system, OWN_COMPONENT, key=options.key)
+        self.telemetry = MavlinkTelemetry()
         self.parameters = ParameterExchange()
-        self.commands = CommandSender((options.system or 1, options.component))
+        self.commands = MavlinkCommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
         self.autopilot: AutopilotProfile | None = None  #: None if unknown or not recognised yet
         self.setpoints: MavlinkSetpoints | None = None  #: None until the autopilot is known, or if it can't be flown
@@ -244,7 +244,7 @@ class MavlinkSession(VehicleSession):
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
             if arrival is PacketOrder.RESTARTED:
                 self.version = None  # a different vehicle with other parameters may be answering
-                self.telemetry = Telemetry()
+                self.telemetry = MavlinkTelemetry()
                 self._lose("the vehicle rebooted", now_ns)
             if arrival is not PacketOrder.NEW:
                 return
@@ -477,7 +477,7 @@ class MavlinkSession(VehicleSession):
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             self._publish_event(event_of(text, "another", Severity.WARNING, system=heartbeat.get_srcSystem()))
         self._kind = heartbeat.autopilot, heartbeat.type
-        self.telemetry, self.parameters, self._health = Telemetry(), ParameterExchange(), HealthMonitor()
+        self.telemetry, self.parameters, self._health = MavlinkTelemetry(), ParameterExchange(), HealthMonitor()
         self.parameters.target = self.commands.target
         self.version = self._known_as = self.setpoints = None
         self._axes.forget()

@@ -94,7 +94,7 @@ class Stream:
         return MspFrame(self.functions[0])
 
 
-class Telemetry:
+class MspTelemetry:
     """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
@@ -195,7 +195,7 @@ class VelocityFilter:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MspMotion:
     """The present motion, with None for unknown values. World axes are east, north, up."""
 
     climb_m_s: float | None = None
@@ -266,14 +266,14 @@ class MotionEstimate:
         before_m = self._ground.get(source, height_m)
         self._ground[source] = before_m + (height_m - before_m) / self._stood
 
-    def at(self, now_ns: int) -> Motion:
+    def at(self, now_ns: int) -> MspMotion:
         yaw = self._heading_rad
         if yaw is not None and self._turned_rad is not None:
             yaw = wrap_angle(yaw + self._turned_rad)
         pose = self._pose
         velocity = self._filter.velocity
         if pose is not None and velocity is not None and now_ns - pose.captured_ns <= POSE_NS:
-            return Motion(
+            return MspMotion(
                 climb_m_s=velocity[2],
                 height_m=pose.position_m[2] - self._ground.get("pose", 0.0),
                 velocity_m_s=velocity,
@@ -283,7 +283,7 @@ class MotionEstimate:
             )
         return self._by_itself(now_ns, yaw)
 
-    def _by_itself(self, now_ns: int, yaw: float | None) -> Motion:
+    def _by_itself(self, now_ns: int, yaw: float | None) -> MspMotion:
         climb = height = None
         if self._altitude is not None and now_ns - self._altitude[1] <= ALTITUDE_NS:
             climb = self._altitude[0].climb_m_s
@@ -296,7 +296,7 @@ class MotionEstimate:
             velocity = gps.speed_m_s * math.sin(course), gps.speed_m_s * math.cos(course), climb or 0.0
             east, north, up = origin.position_of(gps.latitude_deg, gps.longitude_deg, gps.altitude_m)
             position = east, north, up if height is None else height
-        return Motion(climb, height, velocity, position, yaw)
+        return MspMotion(climb, height, velocity, position, yaw)
 
 
 def _yaw(pose: ExternalPose) -> float:
@@ -338,7 +338,7 @@ def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
 
 
 def feedback_of(
-    reported: Reported, motion: Motion, flight: FlightState, captured_ns: int, native: dict[str, Value]
+    reported: Reported, motion: MspMotion, flight: FlightState, captured_ns: int, native: dict[str, Value]
 ) -> Feedback:
     """Return the vehicle's state as feedback. Unknown values are None."""
     attitude, battery = reported.attitude, reported.battery

@@ -30,7 +30,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import AR_DRONE
 from skyloop.vehicles.ardrone.emulator.logic import ArdroneLogic, VideoSettings
-from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
+from skyloop.vehicles.ardrone.emulator.telemetry import ArdroneSnapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.emulator.video import CAMERAS, DroneClock, PavePacker, UvlcPacker
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE, STANDARD, Ports
@@ -335,9 +335,9 @@ class RunningFirmware(RunningEmulator):
         for client, sequence in self._navdata_clients.next_sequences():
             self._navdata_port.send(navdata.encode(state, sequence, options, vision), client)
 
-    def _snapshot(self, report: Report) -> Snapshot:
+    def _snapshot(self, report: Report) -> ArdroneSnapshot:
         flight = self.logic.flight
-        return Snapshot(
+        return ArdroneSnapshot(
             believed=report.believed,
             state=report.believed.state,
             time=self._clock.navdata_time(report.captured_ns),

@@ -30,7 +30,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
-from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
+from skyloop.vehicles.mavlink.emulator.arducopter import EmulatedArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import EmulatedAutopilot
 from skyloop.vehicles.mavlink.emulator.links import (
     Kind,
@@ -42,7 +42,7 @@ from skyloop.vehicles.mavlink.emulator.links import (
     UdpPort,
     with_multirotors,
 )
-from skyloop.vehicles.mavlink.emulator.px4 import Px4
+from skyloop.vehicles.mavlink.emulator.px4 import EmulatedPx4
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]
 
 
-_KINDS: dict[Kind, type[EmulatedAutopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
+_KINDS: dict[Kind, type[EmulatedAutopilot]] = {Kind.ARDUCOPTER: EmulatedArduCopter, Kind.PX4: EmulatedPx4}
 
 
 class RunningFirmware(RunningEmulator):

@@ -14,7 +14,7 @@ from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.emulation.emulator import Address, ByteServer, DatagramPort, Loop
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
 APART: Final = 10  #: difference between the port numbers of two drones
@@ -174,8 +174,8 @@ class Port(Protocol):
     def close(self) -> None: ...
 
 
-def _codec(settings: MavlinkSettings) -> Codec:
-    return Codec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
+def _codec(settings: MavlinkSettings) -> MavlinkCodec:
+    return MavlinkCodec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
 
 
 class UdpPort:

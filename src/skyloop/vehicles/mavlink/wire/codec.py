@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("mavlink://", "mavlink", cause=str(error)) from error
 
-__all__ = ["KEY_BYTES", "MAX_FRAME", "Codec", "Message", "dialect"]
+__all__ = ["KEY_BYTES", "MAX_FRAME", "MavlinkCodec", "Message", "dialect"]
 
 #: A pymavlink message; its fields are attributes.
 Message: TypeAlias = Any
@@ -153,7 +153,7 @@ class _Signatures:
         return True
 
 
-class Codec:
+class MavlinkCodec:
     """One end of a link, with its sequence numbers, incomplete frames and signatures.
 
     With a 32-byte ``key``, everything sent is signed, and everything unsigned but RADIO_STATUS rejected (MAVLink 2).

@@ -172,7 +172,7 @@ def bit(name: str) -> int:
     return 1 << (FLAGS - 1 if name == ARM_SWITCH else BETAFLIGHT_FLAGS.index(name))
 
 
-class Board:
+class EmulatedBoard:
     """One flight controller. Not thread-safe: use it only on the loop's thread.
 
     ``received`` holds the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
@@ -439,7 +439,7 @@ class RunningFirmware(RunningEmulator):
         self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None
     ) -> None:
         super().__init__(host, drone, loop or "skyloop-betaflight")
-        self.board = Board(SimulatedVehicle(host.simulation, drone), settings, monotonic_ns())
+        self.board = EmulatedBoard(SimulatedVehicle(host.simulation, drone), settings, monotonic_ns())
         self._parser = Parser()
         simulation = host.simulation
         first = Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns())
@@ -512,7 +512,7 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
         return self._started.port
 
     @property
-    def board(self) -> Board:
+    def board(self) -> EmulatedBoard:
         """The running flight controller, for tests. Use it only on the loop's thread."""
         return self._started.board
 

@@ -68,7 +68,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class FlightState:
+class BetaflightState:
     """The state sent to Betaflight, in the axes of the packet."""
 
     time_s: float
@@ -80,7 +80,7 @@ class FlightState:
     pressure_pa: float
 
 
-def encode_state(state: FlightState) -> bytes:
+def encode_state(state: BetaflightState) -> bytes:
     """Encode a state as a packet."""
     return _STATE.pack(
         state.time_s,
@@ -93,10 +93,10 @@ def encode_state(state: FlightState) -> bytes:
     )
 
 
-def decode_state(packet: bytes) -> FlightState:
+def decode_state(packet: bytes) -> BetaflightState:
     """Decode a state. Raises :class:`DecodeError`."""
     n = _numbers(_STATE, packet, "state")
-    return FlightState(
+    return BetaflightState(
         n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
     )
 
@@ -309,7 +309,7 @@ class Betaflight(CoupledFirmware):
             velocity = fix.velocity_m_s
         p, q, r = readings.gyro_rad_s
         fx, fy, fz = readings.acceleration_m_s2
-        state = FlightState(
+        state = BetaflightState(
             time_s=TIME_S,
             gyro_rad_s=(p, -q, -r),
             acceleration_m_s2=(-fx, -fy, -fz),
