@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 
 from benchmarks.measuring.tables import Table
-from skyloop.bench import Flight, Machine
+from skyloop.bench import BenchFlight, Machine
 from skyloop.clock import NS_PER_S
 from skyloop.messages import (
     Applied,
@@ -129,7 +129,7 @@ def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda 
 
 def drawn(seconds: float) -> list[Encoded]:
     """Draw and encode the view of a circling drone's camera."""
-    flight = Flight(1, [(0, FRONT_CAMERA.scaled(2.0))])
+    flight = BenchFlight(1, [(0, FRONT_CAMERA.scaled(2.0))])
     encoder = Encoder(H264_360P, FPS, BITRATE_KBPS, group=FPS)
     units = []
     for _ in range(max(FPS, round(seconds) * FPS)):

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.cockpit.commands import FollowTarget
+from skyloop.cockpit.commands import TrackTarget
 from skyloop.cockpit.encoded_feed import FPS, KEPT, RATES, SCALES, EncodedFeed, FeedFormat, form_for
 from skyloop.cockpit.follow_session import in_frame
 from skyloop.cockpit.station import Station
@@ -90,7 +90,7 @@ def test_the_vehicles_encoding_is_relayed_if_it_fits() -> None:
 
 def test_a_box_on_a_smaller_picture_is_of_the_frame() -> None:
     header = FrameHeader("front", 1, 1, 1, 640, 480, Encoding.BGR8, 640 * 480 * 3)
-    command = FollowTarget(n=1, at_s=0.0, camera="front", captured_ns="1", box=(10, 20, 30, 40), size=(320, 240))
+    command = TrackTarget(n=1, at_s=0.0, camera="front", captured_ns="1", box=(10, 20, 30, 40), size=(320, 240))
     assert in_frame(command, header) == (20, 40, 60, 80)
     assert in_frame(msgspec.structs.replace(command, size=None), header) == (10, 20, 30, 40)
 

@@ -23,7 +23,7 @@ from skyloop.messages.relayed import pack
 from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord
-from skyloop.recording.translation import Message, Path, TranslatedImage, Translator
+from skyloop.recording.translation import Message, Trail, TranslatedImage, Translator
 from tests.support.samples import CAMERA
 
 UNIX = 1_000_000_000_000_000_000
@@ -135,7 +135,7 @@ def test_the_path_is_written_once_a_second_and_only_with_positions() -> None:
 
 
 def test_a_long_path_is_thinned_out_evenly() -> None:
-    path = Path()
+    path = Trail()
     for place in range(10_000):
         path.add(place)
     assert len(path.places) <= 400

@@ -102,7 +102,7 @@ class FlyBack(PageCommand, frozen=True, tag="return"):
     """Fly back to the take-off position and then land or hover there, depending on the drone's parameters."""
 
 
-class FlyRoute(PageCommand, frozen=True, tag="route"):
+class StartRoute(PageCommand, frozen=True, tag="route"):
     """Fly a checked route; ``id`` comes from the response to the check."""
 
     id: Annotated[str, msgspec.Meta(max_length=64)]
@@ -130,7 +130,7 @@ class SelectTarget(PageCommand, frozen=True, tag="follow_select"):
     camera: CameraName | None
 
 
-class FollowTarget(PageCommand, frozen=True, tag="follow"):
+class TrackTarget(PageCommand, frozen=True, tag="follow"):
     """Track the object inside a box and, if a mode is given, follow it."""
 
     camera: CameraName
@@ -186,13 +186,13 @@ AnyCommand = (
     | FlyBack
     | Write
     | Alive
-    | FlyRoute
+    | StartRoute
     | PauseRoute
     | ResumeRoute
     | SkipWaypoint
     | StopRoute
     | SelectTarget
-    | FollowTarget
+    | TrackTarget
     | SetFollowMode
     | StopFollowing
 )

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from skyloop.cockpit.access import Gate, SessionFile
     from skyloop.cockpit.discovery import Finder
-    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.fleet import CockpitFleet
     from skyloop.cockpit.station import Station
     from skyloop.messages.parameter import WorldGeometry
     from skyloop.metrics.endpoint import Source
@@ -157,7 +157,7 @@ def serve_cockpit(
         code = f"#pair={pairing.code()}" if on_ready is not None and pairing is not None and not access.pair else ""
 
         from skyloop.cockpit.app import create_app
-        from skyloop.cockpit.fleet import Fleet
+        from skyloop.cockpit.fleet import CockpitFleet
         from skyloop.cockpit.recordings import Recordings
         from skyloop.cockpit.target_tracker import warm_up
 
@@ -165,7 +165,7 @@ def serve_cockpit(
         own_name = () if bind_address(address)[1] else host_names()
         hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
         admission = Admission(places_here())
-        fleet = Fleet(finder, kept=names)
+        fleet = CockpitFleet(finder, kept=names)
         authority = None if access.page_authority is None else access.page_authority.read_bytes()
         kept = Recordings(recordings)
         app = create_app(fleet, kept, hosts, gate, admission=admission, world=given, page_authority=authority)
@@ -375,13 +375,13 @@ async def _run(
         await listening  # raises the error that ended the acceptor
 
 
-def fleet_sources(fleet: Fleet) -> list[Source]:
+def fleet_sources(fleet: CockpitFleet) -> list[Source]:
     """Return the current sources of metrics: one per drone, and one for the fleet."""
     stations = fleet.stations.copy()
     return [partial(_fleet_readings, fleet), *(partial(_readings, name, one) for name, one in stations.items())]
 
 
-def _fleet_readings(fleet: Fleet) -> Iterator[Reading]:
+def _fleet_readings(fleet: CockpitFleet) -> Iterator[Reading]:
     yield Reading("skyloop_cockpit_unreachable", float(len(fleet.problems)))
 
 

@@ -13,7 +13,7 @@ from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.actions import OUTDONE, OVERRULED
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import ThresholdReader
-from skyloop.cockpit.discovery import Found
+from skyloop.cockpit.discovery import FoundProxy
 from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, FeedFormat, SmallFeed
 from skyloop.cockpit.feeds import ROW_HZ, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.routes import CheckedRoutes
@@ -155,7 +155,7 @@ class Station:
     ``drone``: the drone, connected as an observer; closed by :meth:`close`.
     """
 
-    def __init__(self, found: Found, drone: Drone) -> None:
+    def __init__(self, found: FoundProxy, drone: Drone) -> None:
         self.found = found
         self.drone = drone
         self.event_feed = EventFeed(drone)

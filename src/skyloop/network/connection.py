@@ -17,7 +17,7 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
-from skyloop.network.frames import FramePublisher, Variant
+from skyloop.network.frames import FramePublisher, FrameVariant
 from skyloop.network.sealing import Sealer
 from skyloop.network.session import FabricSession, Priority, load
 from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, results, stream, too_many_topics, video
@@ -301,7 +301,7 @@ class Publisher:
         return session.publisher(layout.topic(self._name, topic), priority, best_effort=newest_wins)
 
     def _send_frame(
-        self, variant: Variant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
+        self, variant: FrameVariant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
         """Send an encoded frame. Called on the camera's thread."""
         session, request = self._session, variant.request

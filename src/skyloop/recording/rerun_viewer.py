@@ -58,8 +58,7 @@ from skyloop.recording.options import MB, VIDEO
 from skyloop.recording.pictures import RecordedImage
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.taps import Source, check_names
-from skyloop.recording.translation import Path as Trail
-from skyloop.recording.translation import TranslatedImage
+from skyloop.recording.translation import Trail, TranslatedImage
 
 PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening

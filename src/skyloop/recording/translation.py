@@ -74,7 +74,7 @@ class TranslatedImage:
     data: bytes
 
 
-class Path:
+class Trail:
     """The points of a drone's path, oldest first, thinned to a limited number."""
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class Translator:
         }
         self._parameters: dict[str, Parameter] = {}
         self._intrinsics: dict[str, tuple[int, int, Intrinsics]] = {}
-        self._path = Path()
+        self._path = Trail()
         self._path_due_ns = 0
         self._makers: dict[type, Callable[[Any, int], Iterator[Message]]] = {
             Feedback: self._feedback,

@@ -14,7 +14,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
 from skyloop.recording.layout import Channel, DroneRecord
 from skyloop.recording.pictures import RecordedImage
-from skyloop.recording.plain import Course, shifted
+from skyloop.recording.plain import TimeCourse, shifted
 from skyloop.recording.reader import Item, Recording
 
 #: Channels that are replayed. Annotations and logs are not replayed, because applications create new ones.
@@ -129,7 +129,7 @@ class ReplaySource:
         """Yield the samples received at the given log time or later."""
         resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found along the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
-        course = Course(resets[earlier - 1][1] if earlier else 0)
+        course = TimeCourse(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
             value, at_log_ns = (found.value, found.entry.log_ns) if isinstance(found, Item) else (found, found.log_ns)
             at_ns = course.follow(value, at_log_ns)
@@ -148,7 +148,7 @@ class ReplaySource:
         passed_ns = last.value.published_ns - first.value.published_ns
         if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
             return []  # avoids reading the whole file
-        found, course = [], Course()
+        found, course = [], TimeCourse()
         for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
             before_ns = course.shift_ns
             course.follow(item.value, item.entry.log_ns)

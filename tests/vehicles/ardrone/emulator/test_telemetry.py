@@ -9,7 +9,7 @@ import pytest
 
 from skyloop.messages import FlightState
 from skyloop.vehicles.ardrone.emulator import MOST, Listeners
-from skyloop.vehicles.ardrone.emulator.flight import Progress
+from skyloop.vehicles.ardrone.emulator.flight import ProgressCommand
 from skyloop.vehicles.ardrone.emulator.telemetry import ArdroneSnapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.emulator.video import DroneClock
 from skyloop.vehicles.ardrone.wire import navdata as o
@@ -123,7 +123,7 @@ def test_values_out_of_a_fields_range_are_clamped() -> None:
     wild = replace(
         MOVING, altitude_m=-3.0, battery_v=1e9, angular_velocity_rad_s=(1e6,) * 3, acceleration_m_s2=(-1e6,) * 3
     )
-    progress = Progress(1, 1e30, -1e30, 1e30, 0.0)
+    progress = ProgressCommand(1, 1e30, -1e30, 1e30, 0.0)
     video = VideoStatus(1 << 40, 1 << 40, 1)
     assert (
         len(told(ArdroneSnapshot(wild, FlightState.FLYING, time=0, thrust=9.0, progress=progress, video=video)).options)

@@ -15,7 +15,7 @@ from typing import Final
 from skyloop.messages import FlightState
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
-from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, Progress
+from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, ProgressCommand
 from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.configuration import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
@@ -47,7 +47,7 @@ class ArdroneSnapshot:
     thrust: float = 0.0  #: multiple of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that are reported as level
-    progress: Progress = NO_PROGRESS
+    progress: ProgressCommand = NO_PROGRESS
     flipping: bool = False
     video: VideoStatus = NOTHING_SENT
     channel: VideoChannel = VideoChannel.FRONT
