@@ -13,7 +13,7 @@ from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.arducopter import EmulatedArduCopter
-from skyloop.vehicles.mavlink.emulator.links import MessageIntervals
+from skyloop.vehicles.mavlink.emulator.links import LinkIntervals
 from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
 from skyloop.vehicles.mavlink.emulator.px4 import EmulatedPx4
 from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message, Texts
@@ -26,7 +26,7 @@ HOME_M = 488.0
 class Wire:
     """A link that records sent messages."""
 
-    def __init__(self, streams: MessageIntervals) -> None:
+    def __init__(self, streams: LinkIntervals) -> None:
         self.streams = streams
         self.sent: list[Message] = []
         self._out, self._in = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
@@ -45,7 +45,7 @@ class Rig:
         self.simulation = Simulation(load_world("empty"), 1, seed=1, parameters=vehicle)
         made = EmulatedArduCopter if kind is Kind.ARDUCOPTER else EmulatedPx4
         self.autopilot = made(SimulatedVehicle(self.simulation, 0), 1, boot_s, gps)
-        self.wire = Wire(MessageIntervals(made.RATES))
+        self.wire = Wire(LinkIntervals(made.RATES))
         self.autopilot.ports = (self.wire,)
         self.kind = kind
         self._program = MavlinkCodec(255, 190)

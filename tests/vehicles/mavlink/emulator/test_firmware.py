@@ -17,7 +17,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import PATIENCE_S
 from skyloop.vehicles.emulation.emulator import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.emulator.links import MessageIntervals
+from skyloop.vehicles.mavlink.emulator.links import LinkIntervals
 from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.vehicles.mavlink.emulator.rig import Rig
@@ -90,7 +90,7 @@ def test_ports_in_use_and_invalid_settings_are_refused() -> None:
 
 
 def test_rates_are_kept_and_reported() -> None:
-    streams = MessageIntervals({1: 10.0})
+    streams = LinkIntervals({1: 10.0})
     assert [streams.due(at / 100) for at in (0, 5, 10, 11, 20)] == [[1], [], [1], [], [1]]
     streams.set_interval(1, -1)
     assert (streams.interval_us(1), streams.due(1.0)) == (-1, [])

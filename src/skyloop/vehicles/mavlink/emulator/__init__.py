@@ -34,8 +34,8 @@ from skyloop.vehicles.mavlink.emulator.arducopter import EmulatedArduCopter
 from skyloop.vehicles.mavlink.emulator.autopilot import EmulatedAutopilot
 from skyloop.vehicles.mavlink.emulator.links import (
     Kind,
+    LinkIntervals,
     MavlinkSettings,
-    MessageIntervals,
     Port,
     Ports,
     TcpPort,
@@ -62,11 +62,11 @@ class RunningFirmware(RunningEmulator):
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
         try:
-            udp = UdpPort(self._loop, settings, MessageIntervals(kind.RATES), self._on_message)
+            udp = UdpPort(self._loop, settings, LinkIntervals(kind.RATES), self._on_message)
             self._open.append(udp)
             tcp = None
             if settings.ports.tcp is not None:
-                tcp = TcpPort(self._loop, settings, MessageIntervals(kind.RATES), self._on_message)
+                tcp = TcpPort(self._loop, settings, LinkIntervals(kind.RATES), self._on_message)
                 self._open.append(tcp)
             self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
             self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)

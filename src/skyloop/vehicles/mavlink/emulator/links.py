@@ -115,7 +115,7 @@ class MavlinkSettings:
 MAX_INTERVAL_US: Final = 2**31 - 1  #: maximum value of the interval field in ``MESSAGE_INTERVAL``
 
 
-class MessageIntervals:
+class LinkIntervals:
     """The message intervals on one link. Times are on the autopilot's clock [s]."""
 
     def __init__(self, rates: Mapping[int, float]) -> None:
@@ -167,7 +167,7 @@ PEER_NS: Final = nanoseconds(3.0)  #: time without data after which a peer may b
 class Port(Protocol):
     """A link of the autopilot, with the message rates requested on it."""
 
-    streams: MessageIntervals
+    streams: LinkIntervals
 
     def send(self, message: Message) -> None: ...
 
@@ -181,7 +181,7 @@ def _codec(settings: MavlinkSettings) -> MavlinkCodec:
 class UdpPort:
     """A UDP port that sends to the remote port until a message arrives, then to that message's sender."""
 
-    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: MessageIntervals, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: LinkIntervals, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message
@@ -222,7 +222,7 @@ class UdpPort:
 class TcpPort:
     """A TCP server for one client at a time. The next client waits in the kernel's backlog, receiving nothing."""
 
-    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: MessageIntervals, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: LinkIntervals, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message
