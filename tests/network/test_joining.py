@@ -31,7 +31,7 @@ def answered(payload: bytes) -> Any:
 
 
 def welcome(run: str) -> Any:
-    return answered(packets.encode_own(packets.JoinWelcome(packets.REVISION, run)))
+    return answered(packets.encode_own(packets.Welcome(packets.REVISION, run)))
 
 
 def session(*replies: Any) -> FabricSession:
@@ -63,7 +63,7 @@ def test_a_timed_out_answer_is_not_a_refusal() -> None:
 
 
 def test_an_impostor_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def accept(_request: JoinRequest, _welcome: packets.JoinWelcome) -> None:
+    def accept(_request: JoinRequest, _welcome: packets.Welcome) -> None:
         raise LinkError("its proof is wrong")
 
     monkeypatch.setattr(JoinRequest, "accept", accept)

@@ -56,7 +56,7 @@ def test_the_packet_shown_byte_by_byte() -> None:
 
 
 def test_the_fields_of_the_first_packets() -> None:
-    for struct in (packets.Join, packets.JoinWelcome, packets.ProxyInfo):
+    for struct in (packets.Join, packets.Welcome, packets.ProxyInfo):
         (row,) = re.findall(rf"^\| {struct.__name__} \| (.*) \|$", FABRIC, re.MULTILINE)
         assert re.findall(r"`(\w+)`", row) == [field.name for field in msgspec.structs.fields(struct)]
 

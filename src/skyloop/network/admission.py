@@ -46,7 +46,7 @@ def admit(
 ) -> Admission:
     """Check a request to join. Return its terms, including the proxy's answer. Without keys, everyone is admitted."""
     if ring is None or topics is None:
-        return Admission(packets.encode_own(packets.JoinWelcome(packets.REVISION, run)))
+        return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
     from skyloop.network.keys.agreement import Agreement
 
     proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(request.proof)
@@ -58,7 +58,7 @@ def admit(
     sealer = Seal(agreed.down)
     where = layout.join(name, sender.who, sender.id)
     sealed, trailer = sealer.seal(where, b"", packets.key(topics.generation, topics.key))
-    welcome = packets.encode_own(packets.JoinWelcome(packets.REVISION, run, proof, trailer + sealed))
+    welcome = packets.encode_own(packets.Welcome(packets.REVISION, run, proof, trailer + sealed))
     return Admission(
         welcome, request.proof, identity, agreed.expires, sealer, Open().use(agreed.up), generation=topics.generation
     )
@@ -77,7 +77,7 @@ class JoinRequest:
             self._agreement = Agreement(ring, *_terms(name, run, sender))
             self.proof = self._agreement.offer()
 
-    def accept(self, welcome: packets.JoinWelcome) -> Admission:
+    def accept(self, welcome: packets.Welcome) -> Admission:
         """Check the proxy's answer; return the terms. An answer from an impostor raises :class:`LinkError`."""
         if not self.proof:
             return Admission()

@@ -91,7 +91,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     proof: bytes = b""  #: with keys: proof of the identity, see :mod:`skyloop.network.keys.agreement`
 
 
-class JoinWelcome(msgspec.Struct, frozen=True, array_like=True):
+class Welcome(msgspec.Struct, frozen=True, array_like=True):
     """The answer to a :class:`Join`: the connection is established."""
 
     revision: int
@@ -114,7 +114,7 @@ class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
 
 encode_own = msgspec.msgpack.Encoder().encode
 decode_join = msgspec.msgpack.Decoder(Join).decode
-decode_welcome = msgspec.msgpack.Decoder(JoinWelcome).decode
+decode_welcome = msgspec.msgpack.Decoder(Welcome).decode
 decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 

@@ -169,12 +169,12 @@ def _let_in(rig: Rig, intruder: Intruder) -> None:
     def answer(query: Any) -> None:
         sender = layout.parse_sender(str(query.key_expr))
         wish = packets.decode_join(bytes(query.payload))
-        welcome = packets.JoinWelcome(packets.REVISION, LIAR)
+        welcome = packets.Welcome(packets.REVISION, LIAR)
         if intruder.ring is not None:  # with the keys it has
             terms = (DRONE, wish.run, sender.who, sender.id)
             proof, agreed = Agreement(intruder.ring, *terms).answer(wish.proof)
             topics, trailer = Seal(agreed.down).seal(str(query.key_expr), b"", packets.key(1, bytes(32)))
-            welcome = packets.JoinWelcome(packets.REVISION, LIAR, proof, trailer + topics)
+            welcome = packets.Welcome(packets.REVISION, LIAR, proof, trailer + topics)
         query.reply(query.key_expr, packets.encode_own(welcome))
 
     intruder.held.append(intruder.session.declare_queryable(layout.join(DRONE, "*", "*"), answer))
