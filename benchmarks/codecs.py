@@ -18,7 +18,7 @@ from benchmarks.measuring.contract import Image, picture
 from benchmarks.measuring.schedule import SMALL
 from benchmarks.measuring.workers import STARTS_WITHIN_S, Workers
 from benchmarks.one_core import codecs_on_one_core
-from skyloop.bench import Flight, Machine, Spread, rounds, spread
+from skyloop.bench import BenchFlight, Machine, Spread, rounds, spread
 from skyloop.drivers.live_video import Coded
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
@@ -130,7 +130,7 @@ def timed(work: Sequence[Work], seconds: float, progress: Progress) -> list[int]
 
 def rendered(number: int) -> tuple[list[Image], list[Image]]:
     """Return pictures of a circling drone's front camera, 320×240, and others twice as wide."""
-    flight = Flight(1, [(0, FRONT_CAMERA), (0, FRONT_CAMERA.scaled(2.0))])
+    flight = BenchFlight(1, [(0, FRONT_CAMERA), (0, FRONT_CAMERA.scaled(2.0))])
 
     def draw(at: int) -> Image:
         flight.draw(at)

@@ -16,7 +16,7 @@ from typing import Final
 import msgspec
 
 from benchmarks.measuring.tables import Table
-from skyloop.bench import Flight, Machine
+from skyloop.bench import BenchFlight, Machine
 from skyloop.clock import NS_PER_S
 from skyloop.messages import (
     Applied,
@@ -37,7 +37,7 @@ from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
 from skyloop.recording.review.tables import export_csv, read
 from skyloop.recording.review.video import export_mp4
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import TranslatedImage, Translator
 from skyloop.recording.writer import RecordingFile
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.vehicles.ardrone.emulator.video import H264_360P
@@ -129,7 +129,7 @@ def measure(seconds: float, *, encode: bool = True, progress: Progress = lambda 
 
 def drawn(seconds: float) -> list[Encoded]:
     """Draw and encode the view of a circling drone's camera."""
-    flight = Flight(1, [(0, FRONT_CAMERA.scaled(2.0))])
+    flight = BenchFlight(1, [(0, FRONT_CAMERA.scaled(2.0))])
     encoder = Encoder(H264_360P, FPS, BITRATE_KBPS, group=FPS)
     units = []
     for _ in range(max(FPS, round(seconds) * FPS)):
@@ -181,7 +181,7 @@ def _items(begin_ns: int, seconds: float, units: Sequence[Encoded]) -> Iterator[
             form = H264_360P
             size = form.width * form.height * 3
             header = FrameHeader(CAMERA, number + 1, at_ns, at_ns, form.width, form.height, Encoding.BGR8, size)
-            picture = Picture(FrameRecord(header, at_ns, H264, unit.key), unit.payload)
+            picture = TranslatedImage(FrameRecord(header, at_ns, H264, unit.key), unit.payload)
             yield Item(0, f"video.{CAMERA}", Rank.FRAME, at_ns, picture, len(unit.payload))
 
 

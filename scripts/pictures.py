@@ -21,7 +21,7 @@ from flight_plot import FlightLog, plot
 from numpy.typing import NDArray
 
 import skyloop
-from skyloop.control.follow import FollowMarker, Mode
+from skyloop.control.follow import FollowMarker, FollowPhase
 from skyloop.messages import Annotation, Takeoff
 from skyloop.sim import STEP_S, Simulation, load_world
 from skyloop.sim.camera import CameraModel, CameraPose
@@ -53,7 +53,7 @@ class Filmed(FollowMarker):
 
     def __init__(self, drone: skyloop.Drone) -> None:
         super().__init__(drone, MARKER_ID)
-        self.film: list[tuple[int, Mode, Picture]] = []  # capture [ns], mode, pixels
+        self.film: list[tuple[int, FollowPhase, Picture]] = []  # capture [ns], mode, pixels
         self._number = 0
 
     def on_frame(self, frame: skyloop.Frame) -> None:
@@ -87,12 +87,12 @@ def flight() -> None:
     print(f"flight-plot.svg: {(PICTURES / 'flight-plot.svg').stat().st_size:,} bytes")
 
 
-def _choose(film: list[tuple[int, Mode, Picture]], found_ns: int) -> list[tuple[int, Picture]]:
+def _choose(film: list[tuple[int, FollowPhase, Picture]], found_ns: int) -> list[tuple[int, Picture]]:
     """Return one while searching, the first sighting, and one after 15 s of following."""
-    searching = [(at, picture) for at, mode, picture in film if mode is Mode.SEARCHING and at < found_ns]
+    searching = [(at, picture) for at, mode, picture in film if mode is FollowPhase.SEARCHING and at < found_ns]
     found = next((at, picture) for at, _, picture in film if at == found_ns)
     following = next(
-        (at, picture) for at, mode, picture in film if mode is Mode.FOLLOWING and at - found_ns > 15 * 10**9
+        (at, picture) for at, mode, picture in film if mode is FollowPhase.FOLLOWING and at - found_ns > 15 * 10**9
     )
     return [searching[len(searching) // 2], found, following]
 

@@ -110,11 +110,11 @@ def traced() -> Iterator[None]:
     if hook is None:
         yield
         return
-    from skyloop.network.session import Session
+    from skyloop.network.session import FabricSession
 
-    plain = Session.callback
+    plain = FabricSession.callback
 
-    def callback(self: Session, function: Callable[[Any], None]) -> Any:
+    def callback(self: FabricSession, function: Callable[[Any], None]) -> Any:
         def call(argument: Any) -> None:
             if sys.gettrace() is None:
                 sys.settrace(hook)
@@ -123,5 +123,5 @@ def traced() -> Iterator[None]:
         return plain(self, call)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Session, "callback", callback)
+        patch.setattr(FabricSession, "callback", callback)
         yield

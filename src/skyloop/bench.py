@@ -573,7 +573,7 @@ _WORK: Final[dict[str, Callable[[Any, _Turn, int], None]]] = {"vehicle": _produc
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
+class BenchFleet:
     """Drones in a world: their number, their model, and whether firmware that reads all instruments flies them."""
 
     world: str
@@ -585,13 +585,13 @@ class Fleet:
 #: The fleets to measure: drones in free flight in an open hall; a hundred drones crowded among gates, some of them
 #: touching the gates; and drones modelled down to their rotors in steps of a millisecond, one with all instruments.
 FLEETS: Final = (
-    Fleet("empty", 1),
-    Fleet("empty", 10),
-    Fleet("empty", 100),
-    Fleet("gates", 100),
-    Fleet("empty", 1, "racer", firmware=True),
-    Fleet("street", 1, "racer", firmware=True),
-    Fleet("empty", 100, "crazyflie"),
+    BenchFleet("empty", 1),
+    BenchFleet("empty", 10),
+    BenchFleet("empty", 100),
+    BenchFleet("gates", 100),
+    BenchFleet("empty", 1, "racer", firmware=True),
+    BenchFleet("street", 1, "racer", firmware=True),
+    BenchFleet("empty", 100, "crazyflie"),
 )
 SIZES: Final = (1.0, 2.0)  #: factors for the image width: 1 is the cameras' own size, 2 is twice as wide
 CAMERAS_AT_ONCE: Final = 10  #: number of drones that see each other, each with its front camera
@@ -663,7 +663,7 @@ def measure_sim(seconds: float, progress: Progress = lambda _share, _what: None)
     return SimResults(Machine.here(), physics, drawing)
 
 
-def _measure_physics(fleet: Fleet, seconds: float, progress: Callable[[float], None]) -> PhysicsRow:
+def _measure_physics(fleet: BenchFleet, seconds: float, progress: Callable[[float], None]) -> PhysicsRow:
     from skyloop.sim import STEP_S
 
     simulation = _flown_by_firmware(fleet) if fleet.firmware else _circling(fleet.world, fleet.drones, fleet.model)
@@ -682,7 +682,7 @@ def _measure_pair(factor: float, seconds: float, progress: Callable[[float], Non
     from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
-    flight = Flight(1, [(0, model) for model in models])
+    flight = BenchFlight(1, [(0, model) for model in models])
     pairs = [(flight.draw(0), flight.draw(1)) for _ in rounds(seconds, progress)]
     front, bottom = ([pair[n] for pair in pairs] for n in (0, 1))
     return [
@@ -696,7 +696,7 @@ def _measure_many(seconds: float, progress: Callable[[float], None]) -> DrawingR
     """Render the front cameras of drones that see each other."""
     from skyloop.sim.camera import FRONT_CAMERA
 
-    flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
+    flight = BenchFlight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
     times = [sum(flight.draw(n) for n in range(CAMERAS_AT_ONCE)) for _ in rounds(seconds, progress)]
     return _drawing_row(f"{CAMERAS_AT_ONCE} × front", FRONT_CAMERA, CAMERAS_AT_ONCE, times)
 
@@ -706,7 +706,7 @@ def _drawing_row(cameras: str, model: CameraModel, pictures: int, times: list[in
     return DrawingRow(cameras, model.width, model.height, pictures, spread(times), rate)
 
 
-class Flight:
+class BenchFlight:
     """Drones that fly circles in the furnished room, with cameras that take turns capturing images."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
@@ -748,7 +748,7 @@ class _Hops:
         return (thrust,) * 4
 
 
-def _flown_by_firmware(fleet: Fleet) -> Simulation:
+def _flown_by_firmware(fleet: BenchFleet) -> Simulation:
     from skyloop.sim import Simulation, load_world
     from skyloop.sim.vehicles import VEHICLES
 

@@ -126,7 +126,7 @@ def measured() -> tuple[SimResults, list[float]]:
 
 def test_physics_is_measured_for_each_fleet(measured: tuple[SimResults, list[float]]) -> None:
     rows = measured[0].physics
-    assert [bench.Fleet(row.world, row.drones, row.model, row.firmware) for row in rows] == list(bench.FLEETS)
+    assert [bench.BenchFleet(row.world, row.drones, row.model, row.firmware) for row in rows] == list(bench.FLEETS)
     for row in rows:
         plausible(row.step, bench.LEAST_ROUNDS)
         # Half of the batches took the median or longer, so all together took at least half of the median each.

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.cli.fly import Flight
+from skyloop.cli.fly import ControllerFlight
 from skyloop.client import Drone
 from skyloop.control import Controller
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
@@ -125,7 +125,7 @@ def test_the_callbacks_of_a_controller_that_was_replaced_or_failed_command_no_mo
         proxy.state = FlightState.FLYING
         drone.wait("flying", WAIT_S)
         loaded, said = Loaded(), list[str]()
-        flight = Flight(drone, Listening(drone), said.append)
+        flight = ControllerFlight(drone, Listening(drone), said.append)
         flying = background(lambda: flight.run_reloading(None, loaded, lambda found: found(drone)))  # type: ignore[arg-type]
 
         def load(found: type[Controller], told: str, speed: float | None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skyloop.client.frame import Arrival, FeedbackHistory, to_bgr
+from skyloop.client.frame import FeedbackHistory, ReceivedFrame, to_bgr
 from skyloop.client.session import frame_size
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
@@ -26,8 +26,8 @@ def pixels(size: int = 144) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
     return (np.arange(size) % 251).astype(np.uint8)
 
 
-def arrival(head: FrameHeader, data: np.ndarray[tuple[int], np.dtype[np.uint8]]) -> Arrival:
-    return Arrival(head, data, 3000, 500, FeedbackHistory(), clock=lambda: 4500)
+def arrival(head: FrameHeader, data: np.ndarray[tuple[int], np.dtype[np.uint8]]) -> ReceivedFrame:
+    return ReceivedFrame(head, data, 3000, 500, FeedbackHistory(), clock=lambda: 4500)
 
 
 def test_a_frame_is_the_received_memory_and_knows_its_origin() -> None:
@@ -158,7 +158,7 @@ def test_sizes_are_checked() -> None:
 
 def test_the_state_at_capture_improves_until_it_is_final() -> None:
     history = FeedbackHistory()
-    frame = Arrival(header(), pixels(), 3000, 0, history).frame()
+    frame = ReceivedFrame(header(), pixels(), 3000, 0, history).frame()
     history.add(Feedback(captured_ns=500, altitude_m=1.0))
     assert frame.feedback is not None
     assert (frame.feedback.altitude_m, frame.feedback_reach_s) == (1.0, 500 / 1e9)

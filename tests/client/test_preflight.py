@@ -19,7 +19,7 @@ from skyloop.messages.parameter import MAX_CHECKUP_TEXT, Diagnostic, decode_chec
 from skyloop.vehicles.ardrone.telemetry import diagnose
 from skyloop.vehicles.ardrone.wire.navdata import State
 from skyloop.vehicles.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
-from skyloop.vehicles.tello.telemetry import Health
+from skyloop.vehicles.tello.telemetry import TelloHealth
 from skyloop.vehicles.tello.wire import parse
 
 GOOD = Feedback(
@@ -180,7 +180,7 @@ def test_an_autopilot_that_watches_another_computer_says_so() -> None:
 
 
 def test_a_hot_tello_says_why_it_may_come_down() -> None:
-    watch = Health()
+    watch = TelloHealth()
     assert watch.diagnose() == []
     for celsius, level in ((60, Level.OK), (95, Level.WARN), (88, Level.WARN), (70, Level.OK)):
         watch.changes(parse(f"templ:{celsius - 2};temph:{celsius};bat:50;".encode()))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from tests.cockpit.browser import Deck, browser_and_cockpit
 from tests.support.cockpit import Node, Nodes, cockpit
 from tests.support.testclient import TestClient
@@ -27,7 +27,7 @@ def node() -> Iterator[Node]:
 @pytest.fixture
 def client(node: Node) -> Iterator[TestClient]:
     """The cockpit of that proxy."""
-    with cockpit(Fleet(Nodes(node), search_s=0.05)) as client:
+    with cockpit(CockpitFleet(Nodes(node), search_s=0.05)) as client:
         yield client
 
 

@@ -25,9 +25,9 @@ from skyloop.cockpit.listening import (
     MAX_ANONYMOUS,
     MAX_KNOWN,
     NEXT_S,
+    Acceptor,
     Admission,
     Connection,
-    Listener,
     Places,
     RepeatLimit,
     places_here,
@@ -205,7 +205,7 @@ def test_accepting_pauses_while_the_system_is_out_of_descriptors(
         monkeypatch.setattr(loop, "sock_accept", accept)
         with socket.socket() as bound:
             bound.bind(("127.0.0.1", 0))
-            task = asyncio.create_task(Listener(bound, admission, lambda _: Speaker()).run())
+            task = asyncio.create_task(Acceptor(bound, admission, lambda _: Speaker()).run())
             await asyncio.sleep(0)
             reader, writer = await asyncio.open_connection(*bound.getsockname())
             assert await reader.readexactly(5) == b"hello"
@@ -232,7 +232,7 @@ def test_an_unfinished_handshake_is_closed(monkeypatch: pytest.MonkeyPatch) -> N
         with socket.socket() as bound:
             bound.bind(("127.0.0.1", 0))
             tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-            task = asyncio.create_task(Listener(bound, admission, lambda _: Speaker(), tls, clock).run())
+            task = asyncio.create_task(Acceptor(bound, admission, lambda _: Speaker(), tls, clock).run())
             await asyncio.sleep(0)
             reader, writer = await asyncio.open_connection(*bound.getsockname())
             writer.write(b"\x16\x03\x01")
@@ -259,7 +259,7 @@ def test_a_closed_listening_socket_ends_the_listener(monkeypatch: pytest.MonkeyP
         with socket.socket() as bound:
             bound.bind(("127.0.0.1", 0))
             with pytest.raises(OSError, match="closed"):
-                await Listener(bound, Admission(), lambda _: Speaker()).run()
+                await Acceptor(bound, Admission(), lambda _: Speaker()).run()
 
     asyncio.run(main())
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.cockpit.alarms import PARAMETERS, USUAL, DegradedTimes, Thresholds, alarms, thresholds_of
+from skyloop.cockpit.alarms import PARAMETERS, USUAL, AlarmThresholds, DegradedTimes, alarms, thresholds_of
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.errors import UnknownNameError
 from skyloop.messages import Failsafe, Feedback, FlightState, LinkState, Value
@@ -96,22 +96,28 @@ def test_alarms(given: tuple[Any, Any, Any, Any], told: list[tuple[str, str, str
 def test_a_link_is_an_alarm_once_it_has_been_degraded_for_a_while() -> None:
     times, bad = DegradedTimes(), link(vehicle="degraded", reason="slow")
 
-    def told(status: Any, at_s: float, thresholds: Thresholds = USUAL) -> list[str]:
+    def told(status: Any, at_s: float, thresholds: AlarmThresholds = USUAL) -> list[str]:
         degraded_s = times.update(status, round(at_s * 1e9))
         return [alarm.id for alarm in alarms(status, flying(), 0.1, {}, degraded_s, thresholds)]
 
     assert told(bad, 1.0) == told(bad, 1.4) == []
     assert told(bad, 1.5) == ["vehicle_link"]
-    assert told(bad, 1.5, Thresholds(link_degraded_s=2.0)) == told(bad, 99.0, Thresholds(link_degraded_s=0.0)) == []
+    assert (
+        told(bad, 1.5, AlarmThresholds(link_degraded_s=2.0))
+        == told(bad, 99.0, AlarmThresholds(link_degraded_s=0.0))
+        == []
+    )
     assert told(link(), 100.0) == []
     assert told(bad, 100.1) == [], "it was up in between"
 
 
 def test_thresholds_are_the_drones_and_zero_is_never() -> None:
     late = (link(), flying(battery=0.3), 1.5, {"front": 2.5})
-    told = alarms(*late, {}, Thresholds(battery_low=0.5, battery_critical=0.35, feedback_age_s=2.0, video_age_s=2.0))
+    told = alarms(
+        *late, {}, AlarmThresholds(battery_low=0.5, battery_critical=0.35, feedback_age_s=2.0, video_age_s=2.0)
+    )
     assert [(alarm.id, alarm.severity) for alarm in told] == [("battery", "critical"), ("video_age.front", "warning")]
-    never = Thresholds(battery_low=0.0, battery_critical=0.0, feedback_age_s=0.0, video_age_s=0.0)
+    never = AlarmThresholds(battery_low=0.0, battery_critical=0.0, feedback_age_s=0.0, video_age_s=0.0)
     assert alarms(link(), flying(battery=0.0), 1e6, {"front": 1e6}, {}, never) == []
 
 
@@ -135,4 +141,4 @@ def test_thresholds_that_are_not_numbers_are_ignored(value: Value) -> None:
 
 
 def test_an_older_proxy_without_them_has_the_usual_ones() -> None:
-    assert thresholds_of(Config({"battery.warn": 0.4})) == Thresholds(battery_low=0.4)
+    assert thresholds_of(Config({"battery.warn": 0.4})) == AlarmThresholds(battery_low=0.4)

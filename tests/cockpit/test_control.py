@@ -13,7 +13,7 @@ from starlette.websockets import WebSocketDisconnect
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.control_session import SILENT_S
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.station import PilotConnection
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
@@ -337,7 +337,7 @@ def test_a_flight_ended_by_something_else_is_reported(client: TestClient, node: 
 def test_no_place_without_a_position() -> None:
     blind = Node(position=False)
     try:
-        with cockpit(Fleet(Nodes(blind))) as client, page(client) as pilot:
+        with cockpit(CockpitFleet(Nodes(blind))) as client, page(client) as pilot:
             pilot.take().say("goto", x=1, y=1, z=1)
             assert "does not report its position" in pilot.wait("refused", do="goto")["why"]
     finally:
@@ -538,7 +538,7 @@ def test_a_refusal_is_reported_once_and_nothing_happens_later(client: TestClient
 
 def test_an_observer_gets_no_controls(node: Node) -> None:
     with (
-        cockpit(Fleet(Nodes(node)), this_user(Role.OBSERVER)) as client,
+        cockpit(CockpitFleet(Nodes(node)), this_user(Role.OBSERVER)) as client,
         open_socket(client, "drones/alpha/control") as socket,
     ):
         socket.send_json({"do": "take", "priority": 0})

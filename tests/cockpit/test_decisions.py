@@ -12,7 +12,7 @@ import pytest
 from skyloop.client.parameters import Config
 from skyloop.cockpit.commands import LATE_S, UNTOUCHED_S, Fly, HandWatch
 from skyloop.cockpit.control_session import GONE_S
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.messages import Failsafe, FlightState, Hover, Land, Position, Velocity
 from tests.cockpit.follower import StandIns
 from tests.support.cockpit import ORIGIN, Node, Nodes, cockpit, until
@@ -24,7 +24,7 @@ FAR = {"name": "far", "speed": 1.0, "waypoints": [{"x": 30.0, "y": 0.0, "z": 1.0
 
 @pytest.fixture
 def client(node: Node) -> Iterator[TestClient]:
-    with cockpit(Fleet(Nodes(node), search_s=0.05), follower=StandIns()) as client:
+    with cockpit(CockpitFleet(Nodes(node), search_s=0.05), follower=StandIns()) as client:
         client.headers.update(ORIGIN)
         yield client
 

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.cockpit.commands import FollowTarget
-from skyloop.cockpit.encoded_feed import FPS, KEPT, RATES, SCALES, EncodedFeed, Form, form_for
+from skyloop.cockpit.commands import TrackTarget
+from skyloop.cockpit.encoded_feed import FPS, KEPT, RATES, SCALES, EncodedFeed, FeedFormat, form_for
 from skyloop.cockpit.follow_session import in_frame
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import (
@@ -68,7 +68,7 @@ def unpack(message: bytes) -> tuple[dict[str, Any], bytes]:
 
 def test_similar_panes_share_a_form() -> None:
     forms = {form_for(CAMERA, width) for width in (321, 400, 470, 480)}
-    assert forms == {Form(750, 0.75)}
+    assert forms == {FeedFormat(750, 0.75)}
     assert form_for(CAMERA, 0).scale == form_for(CAMERA, 5000).scale == 1.0
 
 
@@ -90,7 +90,7 @@ def test_the_vehicles_encoding_is_relayed_if_it_fits() -> None:
 
 def test_a_box_on_a_smaller_picture_is_of_the_frame() -> None:
     header = FrameHeader("front", 1, 1, 1, 640, 480, Encoding.BGR8, 640 * 480 * 3)
-    command = FollowTarget(n=1, at_s=0.0, camera="front", captured_ns="1", box=(10, 20, 30, 40), size=(320, 240))
+    command = TrackTarget(n=1, at_s=0.0, camera="front", captured_ns="1", box=(10, 20, 30, 40), size=(320, 240))
     assert in_frame(command, header) == (20, 40, 60, 80)
     assert in_frame(msgspec.structs.replace(command, size=None), header) == (10, 20, 30, 40)
 
@@ -149,7 +149,7 @@ def test_data_under_way_is_bounded() -> None:
 def test_pictures_follow_one_another_or_begin_with_a_key() -> None:
     async def watch() -> None:
         drone = FakeDrone()
-        feed = EncodedFeed(drone, "front", Form(150))  # type: ignore[arg-type]
+        feed = EncodedFeed(drone, "front", FeedFormat(150))  # type: ignore[arg-type]
         feed.subscribe("page", None)
         (stream,) = drone.streams
 
@@ -227,7 +227,9 @@ def test_a_page_that_falls_behind_gets_its_own_stream_that_it_acknowledges(drone
         own.encode()
         assert page.take() == [101, 102]
         assert own.reports[-1] == (102, False)
-        assert page.station.feeds == [page.station.encoded("front", Form(None, 0.5, None, own.request.subscriber))]
+        assert page.station.feeds == [
+            page.station.encoded("front", FeedFormat(None, 0.5, None, own.request.subscriber))
+        ]
         assert page.station.feeds[0].age_s is None, "a slow page is no fault of the camera"
         for _ in range(60):
             page.clock.pass_s(0.2)

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.cockpit.discovery import Found, LocalFinder
-from skyloop.cockpit.fleet import FORGET_S, Fleet, Overview
+from skyloop.cockpit.discovery import FoundProxy, LocalFinder
+from skyloop.cockpit.fleet import FORGET_S, CockpitFleet, FleetOverview
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.messages import LinkState
@@ -36,14 +36,14 @@ class Hangar:
         self.fails: set[str] = set()
         self.connected: list[str] = []
 
-    def __call__(self) -> list[Found]:
-        return [Found(name, "memory", dial) for name in self.found]
+    def __call__(self) -> list[FoundProxy]:
+        return [FoundProxy(name, "memory", dial) for name in self.found]
 
     def add_name(self, name: str) -> None: ...
 
     def close(self) -> None: ...
 
-    def connect(self, found: Found) -> Any:
+    def connect(self, found: FoundProxy) -> Any:
         self.connected.append(found.name)
         if found.name in self.fails:
             raise NoAnswerError(f"{found.name} is stopped")
@@ -57,7 +57,7 @@ def run(work: Callable[[], Awaitable[None]]) -> None:
     asyncio.run(main())
 
 
-async def settle(fleet: Fleet) -> None:
+async def settle(fleet: CockpitFleet) -> None:
     """Search, and wait until the found ones are connected."""
     await fleet.search()
     while fleet._connecting:
@@ -68,7 +68,7 @@ def test_one_connection_per_drone() -> None:
     hangar = Hangar("alpha", "beta")
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect)
+        fleet = CockpitFleet(hangar, hangar.connect)
         await fleet.start()
         for _ in range(3):
             await settle(fleet)
@@ -85,17 +85,17 @@ def test_an_unresponsive_proxy_is_reported_and_retried() -> None:
     hangar.fails.add("alpha")
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect)
+        fleet = CockpitFleet(hangar, hangar.connect)
         await settle(fleet)
         assert fleet.problems == {"alpha": "alpha is stopped"}
-        (row,) = Overview(fleet, Recordings(Path("nowhere"))).rows()
+        (row,) = FleetOverview(fleet, Recordings(Path("nowhere"))).rows()
         assert (row["name"], row["state"]) == ("alpha", "unknown")
         assert [alarm.text for alarm in row["alarms"]] == ["alpha is stopped"]
         assert row["links"]["application"] == "lost"
         hangar.fails.clear()
         await settle(fleet)
         assert not fleet.problems
-        (known,) = Overview(fleet, Recordings(Path("nowhere"))).rows()
+        (known,) = FleetOverview(fleet, Recordings(Path("nowhere"))).rows()
         assert set(known) == set(row), "a row has the same parts whatever is known"
         hangar.fails.add("alpha")
         await fleet.close()
@@ -108,7 +108,7 @@ def test_one_that_is_ending_is_not_joined_again_before_it_is_gone() -> None:
     hangar = Hangar("alpha")
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect)
+        fleet = CockpitFleet(hangar, hangar.connect)
         await settle(fleet)
         fleet.let_go("alpha", ending=True)
         for _ in range(2):
@@ -129,7 +129,7 @@ def test_one_that_was_never_there_leaves_no_trace() -> None:
     hangar.fails.add("alpha")
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect)
+        fleet = CockpitFleet(hangar, hangar.connect)
         await settle(fleet)
         hangar.found.clear()
         await settle(fleet)
@@ -144,7 +144,7 @@ def test_a_lost_drone_is_shown_for_a_while(kept: tuple[str, ...]) -> None:
     hangar, clock = Hangar("alpha", "beta"), ManualClock()
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect, kept=kept, clock=clock)
+        fleet = CockpitFleet(hangar, hangar.connect, kept=kept, clock=clock)
         await settle(fleet)
         hangar.found.remove("alpha")
         hangar.drones["alpha"].link.application = LinkState.LOST
@@ -165,7 +165,7 @@ def test_a_lost_drone_on_a_page_is_not_forgotten_and_one_that_is_back_neither() 
     hangar, clock = Hangar("alpha"), ManualClock()
 
     async def work() -> None:
-        fleet = Fleet(hangar, hangar.connect, clock=clock)
+        fleet = CockpitFleet(hangar, hangar.connect, clock=clock)
         await settle(fleet)
         station = fleet.stations["alpha"]
         wake = asyncio.Event()
@@ -194,7 +194,7 @@ def test_a_failing_finder_is_retried() -> None:
     asked = 0
 
     class Failing(Hangar):
-        def __call__(self) -> list[Found]:
+        def __call__(self) -> list[FoundProxy]:
             nonlocal asked
             asked += 1
             if asked in (2, 3):
@@ -202,7 +202,7 @@ def test_a_failing_finder_is_retried() -> None:
             return hangar()
 
     async def work() -> None:
-        fleet = Fleet(Failing(), hangar.connect, search_s=0.005)
+        fleet = CockpitFleet(Failing(), hangar.connect, search_s=0.005)
         await fleet.start()
         while asked < 5:
             await asyncio.sleep(0.005)
@@ -232,7 +232,7 @@ def rows(client: TestClient) -> list[dict[str, Any]]:
 def test_drones_come_and_go_in_the_overview(nodes: Nodes) -> None:
     gamma = Node("gamma")
     try:
-        with cockpit(Fleet(nodes, search_s=0.02)) as client:
+        with cockpit(CockpitFleet(nodes, search_s=0.02)) as client:
             assert [row["name"] for row in rows(client)] == ["alpha", "beta"]
             assert all(row["transport"] == "memory" and row["can_fly"] for row in rows(client))
             nodes.nodes.append(gamma)
@@ -252,11 +252,14 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
     here = {"local": before}
 
     class Moving(Nodes):
-        def __call__(self) -> list[Found]:
-            return [Found("alpha", where, node.dial) for where, node in here.items() if node.up]
+        def __call__(self) -> list[FoundProxy]:
+            return [FoundProxy("alpha", where, node.dial) for where, node in here.items() if node.up]
 
     try:
-        with cockpit(Fleet(Moving(), search_s=0.02)) as client, open_socket(client, "drones/alpha/telemetry") as page:
+        with (
+            cockpit(CockpitFleet(Moving(), search_s=0.02)) as client,
+            open_socket(client, "drones/alpha/telemetry") as page,
+        ):
             until(lambda: rows(client)[0]["links"]["application"] == "up")
             before.stop()
             here.clear()
@@ -272,7 +275,7 @@ def test_a_drone_that_moves_to_another_host_under_its_name_is_joined_there() -> 
 
 
 def test_the_overview_shows_the_holder_of_control(nodes: Nodes) -> None:
-    with cockpit(Fleet(nodes, search_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
+    with cockpit(CockpitFleet(nodes, search_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
         control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})
         until(lambda: rows(client)[0]["me"])
         first, second = rows(client)
@@ -311,7 +314,7 @@ def test_a_row_needs_little_feedback_and_the_whole_drone_all_of_it() -> None:
     node = Node()
     server, slow = node._server, "feedback?max_hz=2"
     try:
-        with cockpit(Fleet(Nodes(node))) as client:
+        with cockpit(CockpitFleet(Nodes(node))) as client:
             until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK))
             with open_socket(client, "drones/alpha/telemetry") as socket:
                 socket.receive_json()

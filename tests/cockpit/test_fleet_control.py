@@ -10,8 +10,8 @@ import pytest
 from starlette.websockets import WebSocketDisconnect
 
 from skyloop.client import Drone
-from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.fleet import Fleet, observe
+from skyloop.cockpit.discovery import FoundProxy
+from skyloop.cockpit.fleet import CockpitFleet, observe
 from skyloop.errors import LinkError
 from skyloop.messages import EmergencyStop, FlightState, Land, Role
 from tests.support.cockpit import Node, Nodes, cockpit, open_socket, this_user, until
@@ -35,7 +35,7 @@ def everybody(client: TestClient) -> Iterator[Page]:
 
 def test_stop_all_cuts_the_motors_of_drones_that_no_page_shows(nodes: tuple[Node, Node]) -> None:
     with (
-        cockpit(Fleet(Nodes(*nodes), search_s=0.05)) as client,
+        cockpit(CockpitFleet(Nodes(*nodes), search_s=0.05)) as client,
         everybody(client) as pilot,
         nodes[0].connect("demo", priority=0, on_exit="hover") as demo,
     ):
@@ -51,12 +51,12 @@ def test_stop_all_cuts_the_motors_of_drones_that_no_page_shows(nodes: tuple[Node
 def test_unreachable_drones_are_reported_as_not_stopped(nodes: tuple[Node, Node], do: str) -> None:
     """It was left out, and all seemed to be stopped."""
 
-    def connect(found: Found) -> Drone:
+    def connect(found: FoundProxy) -> Drone:
         if found.name == "beta":
             raise LinkError("beta does not answer")
         return observe(found)
 
-    fleet = Fleet(Nodes(*nodes), connect, search_s=0.05)
+    fleet = CockpitFleet(Nodes(*nodes), connect, search_s=0.05)
     with cockpit(fleet) as client, everybody(client) as pilot:
         until(lambda: fleet.problems)
         pilot.say(do)
@@ -68,7 +68,7 @@ def test_unreachable_drones_are_reported_as_not_stopped(nodes: tuple[Node, Node]
 def test_land_all_lands_what_others_fly_and_gives_control_back(nodes: tuple[Node, Node]) -> None:
     alpha, beta = nodes
     with (
-        cockpit(Fleet(Nodes(*nodes), search_s=0.05)) as client,
+        cockpit(CockpitFleet(Nodes(*nodes), search_s=0.05)) as client,
         everybody(client) as pilot,
         alpha.connect("demo", on_exit="hover") as demo,
         page(client, "beta") as flies,
@@ -86,7 +86,7 @@ def test_land_all_lands_what_others_fly_and_gives_control_back(nodes: tuple[Node
 def test_drones_that_do_not_land_are_reported_with_the_reason(nodes: tuple[Node, Node]) -> None:
     alpha, beta = nodes
     with (
-        cockpit(Fleet(Nodes(*nodes), search_s=0.05)) as client,
+        cockpit(CockpitFleet(Nodes(*nodes), search_s=0.05)) as client,
         everybody(client) as pilot,
         alpha.connect("demo", priority=0, on_exit="hover") as demo,
         beta.connect("other", on_exit="hover") as other,
@@ -100,7 +100,7 @@ def test_drones_that_do_not_land_are_reported_with_the_reason(nodes: tuple[Node,
 
 def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node, Node]) -> None:
     """The landing took the authority during the stop, and a vehicle that had not received the stop obeyed it."""
-    fleet = Fleet(Nodes(*nodes), search_s=0.05)
+    fleet = CockpitFleet(Nodes(*nodes), search_s=0.05)
     with cockpit(fleet) as client, everybody(client) as pilot:
         until(lambda: len(fleet.stations) == 2)
         fleet.stations["alpha"]._stops = 1
@@ -110,7 +110,10 @@ def test_a_drone_whose_motors_are_being_stopped_is_not_landed(nodes: tuple[Node,
 
 
 def test_landing_all_continues_without_the_page(nodes: tuple[Node, Node]) -> None:
-    with cockpit(Fleet(Nodes(*nodes), search_s=0.05)) as client, nodes[0].connect("demo", on_exit="hover") as demo:
+    with (
+        cockpit(CockpitFleet(Nodes(*nodes), search_s=0.05)) as client,
+        nodes[0].connect("demo", on_exit="hover") as demo,
+    ):
         demo.takeoff()
         with everybody(client) as pilot:
             pilot.say("land_all")
@@ -119,7 +122,7 @@ def test_landing_all_continues_without_the_page(nodes: tuple[Node, Node]) -> Non
 
 
 def test_old_commands_to_all_are_refused(nodes: tuple[Node, Node]) -> None:
-    with cockpit(Fleet(Nodes(*nodes), search_s=0.05)) as client, everybody(client) as pilot:
+    with cockpit(CockpitFleet(Nodes(*nodes), search_s=0.05)) as client, everybody(client) as pilot:
         pilot.say("stop_all", at_s=time.monotonic() - 3.0)
         assert "3.0 s after" in pilot.wait("refused", do="stop_all")["why"]
         pilot.say("land_all", at_s=time.monotonic() - 1.0)
@@ -134,7 +137,7 @@ def test_old_commands_to_all_are_refused(nodes: tuple[Node, Node]) -> None:
 def test_a_recording_is_not_landed_or_stopped(node: Node) -> None:
     played = Node("played", uri="replay:///home/me/flight.mcap")
     try:
-        with cockpit(Fleet(Nodes(node, played), search_s=0.05)) as client, everybody(client) as pilot:
+        with cockpit(CockpitFleet(Nodes(node, played), search_s=0.05)) as client, everybody(client) as pilot:
             pilot.say("stop_all")
             assert pilot.wait("sent")["drones"] == ["alpha"]
             until(lambda: node.flyer.state is FlightState.EMERGENCY)
@@ -145,7 +148,7 @@ def test_a_recording_is_not_landed_or_stopped(node: Node) -> None:
 
 def test_an_observer_cannot_stop_drones(nodes: tuple[Node, Node]) -> None:
     with (
-        cockpit(Fleet(Nodes(*nodes)), this_user(Role.OBSERVER)) as client,
+        cockpit(CockpitFleet(Nodes(*nodes)), this_user(Role.OBSERVER)) as client,
         open_socket(client, "control") as socket,
     ):
         socket.send_json({"do": "stop_all", "at_s": time.monotonic()})

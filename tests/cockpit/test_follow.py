@@ -17,7 +17,7 @@ import pytest
 from skyloop.client import Drone, Frame
 from skyloop.cockpit import follow_session
 from skyloop.cockpit.commands import decode_command
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.follow_session import NO_CONTROL
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Annotation, FlightState, Hover, Velocity
@@ -55,7 +55,7 @@ def stand_ins() -> StandIns:
 
 @pytest.fixture
 def client(node: Node, stand_ins: StandIns) -> Iterator[TestClient]:
-    with cockpit(Fleet(Nodes(node), search_s=0.05), follower=stand_ins) as client:
+    with cockpit(CockpitFleet(Nodes(node), search_s=0.05), follower=stand_ins) as client:
         yield client
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skyloop.client.frame import Arrival, FeedbackHistory, compressed
+from skyloop.client.frame import FeedbackHistory, ReceivedFrame, compressed
 from skyloop.cockpit.target_tracker import KEPT_S, STRIDE_S, KeptFrames
 from skyloop.errors import RefusedError
 from skyloop.messages import Encoding, FrameHeader
@@ -13,9 +13,9 @@ from skyloop.messages import Encoding, FrameHeader
 MS = 1_000_000
 
 
-def frame(at_ms: int, size: int = 1000) -> Arrival:
+def frame(at_ms: int, size: int = 1000) -> ReceivedFrame:
     header = FrameHeader("front", at_ms, at_ms * MS, at_ms * MS, 32, 24, Encoding.JPEG, size)
-    return Arrival(header, np.zeros(size, np.uint8), at_ms * MS, 0, FeedbackHistory())
+    return ReceivedFrame(header, np.zeros(size, np.uint8), at_ms * MS, 0, FeedbackHistory())
 
 
 def kept(*at_ms: int, most_bytes: int = 1_000_000) -> KeptFrames:
@@ -72,7 +72,7 @@ def test_catching_up_takes_each_frame_but_those_closer_than_a_stride() -> None:
 def test_a_frame_kept_as_jpeg_can_be_restored() -> None:
     pixels = np.full((24, 32, 3), (200, 40, 90), np.uint8)
     header = FrameHeader("front", 3, 70, 80, 32, 24, Encoding.BGR8, pixels.size)
-    original = Arrival(header, pixels.reshape(-1), 90, 5, FeedbackHistory()).frame()
+    original = ReceivedFrame(header, pixels.reshape(-1), 90, 5, FeedbackHistory()).frame()
     again = compressed(original).frame()
     assert (again.camera, again.seq, again.captured_ns, again.received_ns) == ("front", 3, 70, 90)
     assert again.shape == original.shape

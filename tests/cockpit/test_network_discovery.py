@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("zenoh", reason="needs Zenoh: skyloop install network")
 
 import skyloop
-from skyloop.cockpit.discovery import Found, LocalFinder, NetworkFinder
+from skyloop.cockpit.discovery import FoundProxy, LocalFinder, NetworkFinder
 from skyloop.network import FabricServer, FabricSettings
 from skyloop.network.config import free_port
 from skyloop.transport.composite import CompositeServer
@@ -90,7 +90,7 @@ def test_two_searches_at_once_share_a_session(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("skyloop.network.session.release", released.append)
     monkeypatch.setattr("skyloop.network.discovery.runs", lambda session: [("bravo", "run")])
     finder = NetworkFinder(LocalFinder(), FabricSettings(multicast=False))
-    found: list[Found] = []
+    found: list[FoundProxy] = []
     threads = [threading.Thread(target=lambda: found.extend(finder())) for _ in range(2)]
     for thread in threads:
         thread.start()

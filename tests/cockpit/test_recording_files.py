@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from skyloop.client import Drone
 from skyloop.cockpit import recording_files
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.recording_files import Mark, Notes, check_name, notes_path
 from skyloop.cockpit.recordings import Recordings, timeline
 from skyloop.drivers.registry import make_driver
@@ -44,7 +44,7 @@ def nodes() -> Iterator[Nodes]:
 
 def serve(nodes: Nodes, folder: Path, **options: Any) -> Any:
     gate = options.pop("gate", this_user())
-    return cockpit(Fleet(nodes, search_s=0.02), recordings=Recordings(folder, **options), gate=gate)
+    return cockpit(CockpitFleet(nodes, search_s=0.02), recordings=Recordings(folder, **options), gate=gate)
 
 
 def post(client: TestClient, path: str, body: Any = None) -> Any:

@@ -13,7 +13,7 @@ import pytest
 from starlette.websockets import WebSocketDisconnect
 
 from skyloop.client import Drone
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
 from skyloop.recording import Recorder, record
@@ -36,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def serve(nodes: Nodes, folder: Path, **options: Any) -> Any:
-    return cockpit(Fleet(nodes, search_s=0.02), recordings=Recordings(folder, **options))
+    return cockpit(CockpitFleet(nodes, search_s=0.02), recordings=Recordings(folder, **options))
 
 
 def post(client: TestClient, path: str, body: Any = None) -> Any:

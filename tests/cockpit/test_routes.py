@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from skyloop.cockpit import control_session
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.routes import MOST_CHECKED, CheckedRoutes, RouteFiles
 from skyloop.cockpit.station import PilotConnection
@@ -38,7 +38,7 @@ def route(*places: tuple[float, float, float]) -> Route:
 
 @pytest.fixture
 def client(node: Node, tmp_path: Path) -> Iterator[TestClient]:
-    with cockpit(Fleet(Nodes(node)), recordings=Recordings(tmp_path)) as client:
+    with cockpit(CockpitFleet(Nodes(node)), recordings=Recordings(tmp_path)) as client:
         client.headers.update(ORIGIN)
         yield client
 

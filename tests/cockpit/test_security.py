@@ -13,7 +13,7 @@ from hypothesis import strategies as some
 from starlette.websockets import WebSocketDisconnect
 
 from skyloop.cockpit.access import OpenGate, Person, Token, TokenGate
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import bind_address, foreign, needed, own_names
 from skyloop.errors import UsageError
@@ -174,7 +174,7 @@ def guarded(node: Node, tmp_path: Path) -> Iterator[TestClient]:
     """A cockpit that asks for tokens, with a drone that can fly."""
     tokens = [Token(Person(Role.PILOT, "ann"), PILOT.encode()), Token(Person(Role.OBSERVER), OBSERVER.encode())]
     with cockpit(
-        Fleet(Nodes(node)), TokenGate(tokens, "skyloop-cockpit-8123"), Recordings(tmp_path, FakeRecorder)
+        CockpitFleet(Nodes(node)), TokenGate(tokens, "skyloop-cockpit-8123"), Recordings(tmp_path, FakeRecorder)
     ) as client:
         yield client
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.messages import CameraInfo, Capabilities, Encoding, EventKind, Feedback, FrameHeader, Severity
 from tests.support.marker_pictures import INTRINSICS, facing, picture
 
@@ -62,4 +62,4 @@ def frame(captured_ns: int, markers: list[tuple[int, list[float]]], known: bool 
     if known:
         history.add(state(captured_ns))
     header = FrameHeader("front", 1, captured_ns, captured_ns, 320, 240, Encoding.BGR8, image.size, INTRINSICS)
-    return Arrival(header, image.reshape(-1), captured_ns, 0, history).frame()
+    return ReceivedFrame(header, image.reshape(-1), captured_ns, 0, history).frame()

@@ -15,7 +15,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.airframe import DRAG_PER_S, Airframe, AirframeLaw, Part, TiltVelocity
 from skyloop.control.chase_law import FollowMode
 from skyloop.control.course_law import CourseLaw, GatePlace
-from skyloop.control.follow import FollowLaw, Mode
+from skyloop.control.follow import FollowLaw, FollowPhase
 from skyloop.control.gate_law import GateLaw, GatePhase
 from skyloop.control.image_servo import FlowLaw, FlowPhase, ImageServoLaw
 from skyloop.control.landing_law import LandingLaw, LandingPhase
@@ -268,7 +268,11 @@ def test_a_target_seen_before_a_gap_is_not_flown_to_after_it() -> None:
             if at_s < 2.0:
                 see(law, state(at_s), AHEAD)
             law.step(nanoseconds(at_s))
-    assert (follow.mode, gate.phase, landing.phase) == (Mode.SEARCHING, GatePhase.SEARCHING, LandingPhase.SEARCHING)
+    assert (follow.mode, gate.phase, landing.phase) == (
+        FollowPhase.SEARCHING,
+        GatePhase.SEARCHING,
+        LandingPhase.SEARCHING,
+    )
 
 
 @pytest.mark.parametrize("number", [0, 1, 4])

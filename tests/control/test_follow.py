@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from skyloop.client.frame import Frame
-from skyloop.control.follow import FollowMarker, FollowScore, Mode
+from skyloop.control.follow import FollowMarker, FollowPhase, FollowScore
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     Polyline,
@@ -32,7 +32,7 @@ def test_goes_to_its_own_marker_and_draws_it(follower: FollowMarker, drone: Reco
     now = time.monotonic_ns()
     follower.on_feedback(state(now))
     follower.on_frame(frame(now, [(7, [0.3, 0.0, 2.5]), (3, [-0.5, 0.0, 2.0])]))
-    assert follower.mode is Mode.FOLLOWING
+    assert follower.mode is FollowPhase.FOLLOWING
     assert drone.velocities[-1]["forward"] > 0.2
     assert drone.velocities[-1]["yaw_rate"] < -0.05, "the marker is to the right"
     texts = [shape.text for shape in drone.drawn[-1] if isinstance(shape, Text)]
@@ -45,7 +45,7 @@ def test_searches_for_its_own_marker_only(follower: FollowMarker, drone: Recorde
     now = time.monotonic_ns()
     follower.on_feedback(state(now))
     follower.on_frame(frame(now, [(3, [0.0, 0.0, 2.0])]))
-    assert follower.mode is Mode.SEARCHING
+    assert follower.mode is FollowPhase.SEARCHING
     assert drone.velocities[-1]["yaw_rate"] == pytest.approx(0.7)
     assert drone.velocities[-1]["forward"] == 0.0
     assert follower.score.share_in_view is None

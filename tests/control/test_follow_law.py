@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.control.airframe import Airframe
-from skyloop.control.follow import FollowLaw, FollowSettings, Mode, TargetFilter
+from skyloop.control.follow import FollowLaw, FollowPhase, FollowSettings, TargetFilter
 from skyloop.messages import Feedback
 from tests.control.follow_world import FollowWorld
 
@@ -67,7 +67,7 @@ def test_loss_is_followed_by_search_and_recovery() -> None:
     world.board.hidden = False
     world.run(12.0)
     modes.append(world.law.mode)
-    assert modes == [Mode.FOLLOWING, Mode.RECOVERING, Mode.SEARCHING, Mode.FOLLOWING]
+    assert modes == [FollowPhase.FOLLOWING, FollowPhase.RECOVERING, FollowPhase.SEARCHING, FollowPhase.FOLLOWING]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_search_turns_and_goes_to_other_heights() -> None:
         assert wanted.forward == wanted.left == 0.0
         yaw, altitude = math.remainder(yaw + wanted.yaw_rate * 0.02, 2 * math.pi), altitude + wanted.up * 0.02
         heights.append(altitude)
-    assert law.mode is Mode.SEARCHING
+    assert law.mode is FollowPhase.SEARCHING
     assert heights[300] == pytest.approx(1.0, abs=0.02)
     assert max(heights) == pytest.approx(1.5, abs=0.05)
 

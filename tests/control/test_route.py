@@ -26,7 +26,7 @@ from skyloop.control.route import (
     parse_route,
     save_route,
 )
-from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
+from skyloop.control.route_law import Effect, Progress, RouteCommand, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Feedback, FlightState, Hover, Land, Position, Value
 from skyloop.zones import Box, Cylinder, Space
@@ -193,7 +193,7 @@ def at(x: float, y: float, z: float, yaw: float = 0.0, **more: Any) -> Feedback:
 
 
 def actions_of(effects: list[Effect]) -> list[object]:
-    return [effect.action for effect in effects if isinstance(effect, Command)]
+    return [effect.action for effect in effects if isinstance(effect, RouteCommand)]
 
 
 def kinds(effects: list[Effect]) -> list[str]:

@@ -17,7 +17,7 @@ import pytest
 
 from skyloop.clock import ManualClock
 from skyloop.drivers.byte_stream import END_S, STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.support.systems import PLATFORM, only_on
 
@@ -79,7 +79,7 @@ def test_the_vehicle_discards_a_frame_cut_by_a_full_port_but_not_the_next(
     """A port that is full for a moment cuts one frame in a hundred. That broke the connection: the vehicle hovered."""
     pytest.importorskip("serial")
     far, device = line
-    station, vehicle = Codec(255, 190), FlightControllerParser()
+    station, vehicle = MavlinkCodec(255, 190), FlightControllerParser()
     old = m.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.5)
     new = m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     write = os.write
@@ -208,7 +208,7 @@ class FlightControllerParser:
 
     def __init__(self) -> None:
         self._kept = bytearray()
-        self._codec = Codec(1, 1)
+        self._codec = MavlinkCodec(1, 1)
 
     def feed(self, data: bytes) -> list[Message]:
         self._kept += data
@@ -224,7 +224,7 @@ class FlightControllerParser:
 
 def test_a_stop_precedes_the_backlog_and_is_not_parsed_as_the_end_of_a_cut_frame(uart: Uart) -> None:
     """The reader stalls within a frame, whose rest is discarded: the next frame that it decodes is the stop."""
-    clock, station, vehicle = ManualClock(), Codec(255, 190), FlightControllerParser()
+    clock, station, vehicle = ManualClock(), MavlinkCodec(255, 190), FlightControllerParser()
     target = m.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1.0, 0.0, 0.0, 0.0], 0.1, 0.2, 0.3, 0.5)
     stop = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0.0, 21196.0, 0, 0, 0, 0, 0)
     with closing(SerialStream(uart.device, 57_600, "x", "mavlink", clock)) as stream:

@@ -19,10 +19,10 @@ from skyloop.host.fleet import Defaults, FlightLimits, encode_handed
 from skyloop.host.serve import (
     Add,
     AddNamed,
-    Answer,
     ControlServer,
+    HostAnswer,
     Remove,
-    Status,
+    StatusRequest,
     ask,
     chosen_host,
     respond,
@@ -58,7 +58,7 @@ def test_vehicles_join_and_leave(served: Hosting) -> None:
     proxy = served.shared("alpha").proxy
     assert proxy is not None
     assert proxy.handler.checks.airspace.settings.limits.speed == 0.5
-    assert [row.name for row in ask("host", Status()).vehicles] == ["alpha"]
+    assert [row.name for row in ask("host", StatusRequest()).vehicles] == ["alpha"]
     served.vehicle("bravo").fail = {"open"}
     answer = ask("host", Add(tuple(map(served.settings, ("alpha", "bravo")))))
     assert [(row.name, row.condition.value) for row in answer.vehicles] == [("alpha", "running"), ("bravo", "failed")]
@@ -88,17 +88,17 @@ def test_garbage_and_silent_callers_do_no_harm(served: Hosting) -> None:
         sock = find_directory(None, HOST).connect("host")
         if packet:
             sock.send(packet)
-            answer = msgspec.json.decode(sock.recv(1 << 16), type=Answer)
+            answer = msgspec.json.decode(sock.recv(1 << 16), type=HostAnswer)
             assert "malformed request" in answer.error
         sock.hang_up()
-    assert ask("host", Status()).vehicles == ()
+    assert ask("host", StatusRequest()).vehicles == ()
 
 
 def test_a_large_answer_arrives_whole(served: Hosting) -> None:
     for number in range(600):
         name = f"vehicle-{number:04}-of-a-very-large-fleet"
         served.host.known[name] = served.settings(name)
-    assert len(ask("host", Status()).vehicles) == 600
+    assert len(ask("host", StatusRequest()).vehicles) == 600
 
 
 def test_other_users_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,33 +108,33 @@ def test_other_users_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyP
 
 
 def test_a_failing_host_reports_that(monkeypatch: pytest.MonkeyPatch) -> None:
-    def answering(_: serve.Request) -> Answer:
+    def answering(_: serve.Request) -> HostAnswer:
         raise RuntimeError("on purpose")
 
     server = ControlServer("host", answering)
     server.start()
     with pytest.raises(RefusedError, match="on purpose"):
-        ask("host", Status())
+        ask("host", StatusRequest())
     with pytest.raises(NameTakenError, match="in use by a running host"):
         ControlServer("host", answering).start()
     server.stop()
     with pytest.raises(LinkError, match="can't be reached"):
-        ask("host", Status())
+        ask("host", StatusRequest())
 
 
 def test_a_host_that_ends_before_it_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ControlServer, "_answer", lambda self, sock: None)
-    server = ControlServer("host", lambda _: Answer())
+    server = ControlServer("host", lambda _: HostAnswer())
     server.start()
     with pytest.raises(LinkError, match="ended before it answered"):
-        ask("host", Status())
+        ask("host", StatusRequest())
     server.stop()
 
 
 def test_the_intended_host_is_found() -> None:
     with pytest.raises(UsageError, match=r"skyloop host fleet\.toml"):
         chosen_host()
-    servers = [ControlServer(name, lambda _: Answer()) for name in ("one", "two")]
+    servers = [ControlServer(name, lambda _: HostAnswer()) for name in ("one", "two")]
     servers[0].start()
     assert chosen_host() == "one"
     servers[1].start()
@@ -200,7 +200,7 @@ def test_a_large_fleet_is_added_in_one_request(served: Hosting) -> None:
     )
     assert len(encode_handed(Add(many))) > 1 << 17
     taken: list[serve.Request] = []
-    server = ControlServer("large", lambda request: taken.append(request) or Answer())  # type: ignore[func-returns-value]
+    server = ControlServer("large", lambda request: taken.append(request) or HostAnswer())  # type: ignore[func-returns-value]
     server.start()
     try:
         ask("large", Add(many))
@@ -225,7 +225,7 @@ def test_without_descriptors_the_control_socket_uses_little_cpu() -> None:
 
         def hang_up(self) -> None: ...
 
-    server, full = ControlServer("full", lambda _: Answer()), Full()
+    server, full = ControlServer("full", lambda _: HostAnswer()), Full()
     server._listener = full  # type: ignore[assignment]
     thread = threading.Thread(target=server._run, args=(full,))
     thread.start()

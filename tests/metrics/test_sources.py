@@ -9,13 +9,13 @@ from typing import Any, cast
 import pytest
 
 from skyloop.client.drone import open_drone
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.server import fleet_sources
 from skyloop.messages import EventKind, LinkState, Role, Velocity
 from skyloop.metrics import FAMILIES, Reading, client_readings, proxy_readings, router_readings
 from skyloop.network import FabricServer, FabricSettings
 from skyloop.network.config import free_port
-from skyloop.network.session import Session
+from skyloop.network.session import FabricSession
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.testing import header, picture
 from tests.support.proxy_bench import Bench
@@ -134,7 +134,7 @@ def test_a_fleet_of_the_cockpit() -> None:
     with scripted() as proxy, open_drone(proxy.server.dial, app="eye", access="observe") as drone:
         station = SimpleNamespace(drone=drone, pilots={1, 2})
         fleet = SimpleNamespace(stations={"scripted": station}, problems={"bravo": "it is stopped"})
-        found = values(reading for source in fleet_sources(cast(Fleet, fleet)) for reading in source())
+        found = values(reading for source in fleet_sources(cast(CockpitFleet, fleet)) for reading in source())
     assert found[("skyloop_cockpit_unreachable",)] == 1
     assert found["skyloop_cockpit_pilots", "scripted"] == 2
     assert found["skyloop_client_link_state", "scripted", "up"] == 1
@@ -145,7 +145,7 @@ def test_a_router() -> None:
     transports = [SimpleNamespace(whatami=kind) for kind in kinds]
     info = SimpleNamespace(transports=lambda: transports)
     session = SimpleNamespace(zenoh=SimpleNamespace(info=info), shut_out=lambda: frozenset({"bad"}))
-    found = values(iter(list(router_readings(lambda: cast(Session, session))())))
+    found = values(iter(list(router_readings(lambda: cast(FabricSession, session))())))
     assert found == {
         ("skyloop_router_links", "router"): 1,
         ("skyloop_router_links", "peer"): 2,

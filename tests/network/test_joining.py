@@ -14,7 +14,7 @@ from skyloop.network import client, discovery, layout, packets
 from skyloop.network.admission import JoinRequest
 from skyloop.network.config import FabricSettings
 from skyloop.network.discovery import ProxyWatch, join
-from skyloop.network.session import Session
+from skyloop.network.session import FabricSession
 from skyloop.transport.testing import ClientLog
 
 RUN, OTHER = "1" * 16, "2" * 16
@@ -34,9 +34,11 @@ def welcome(run: str) -> Any:
     return answered(packets.encode_own(packets.Welcome(packets.REVISION, run)))
 
 
-def session(*replies: Any) -> Session:
+def session(*replies: Any) -> FabricSession:
     settings = SimpleNamespace(who="anyone", ring=None, tls=None)
-    return cast("Session", SimpleNamespace(settings=settings, zenoh=SimpleNamespace(get=lambda *_, **__: replies)))
+    return cast(
+        "FabricSession", SimpleNamespace(settings=settings, zenoh=SimpleNamespace(get=lambda *_, **__: replies))
+    )
 
 
 def test_answers_of_others_are_skipped() -> None:
@@ -75,12 +77,12 @@ def test_an_unknown_name_differs_from_an_incomplete_list(
 ) -> None:
     asked: list[float] = []
 
-    def listed(_session: Session, *, within_s: float) -> tuple[set[tuple[str, str]], bool]:
+    def listed(_session: FabricSession, *, within_s: float) -> tuple[set[tuple[str, str]], bool]:
         asked.append(within_s)
         return {("bravo", OTHER)}, complete
 
     monkeypatch.setattr(discovery, "listed", listed)
-    there = cast("Session", SimpleNamespace(settings=FabricSettings()))
+    there = cast("FabricSession", SimpleNamespace(settings=FabricSettings()))
     with pytest.raises(error):
         ProxyWatch(there, "alpha", lambda _: None).find(0.0, 0.5)
     assert asked == [0.5]
@@ -92,12 +94,14 @@ def test_a_known_proxy_is_not_asked_again_unless_there_is_a_choice(
 ) -> None:
     asked: list[str] = []
 
-    def oldest_first(_session: Session, name: str) -> list[packets.ProxyInfo]:
+    def oldest_first(_session: FabricSession, name: str) -> list[packets.ProxyInfo]:
         asked.append(name)
         return []
 
     monkeypatch.setattr(discovery, "oldest_first", oldest_first)
-    watch = ProxyWatch(cast("Session", SimpleNamespace(settings=FabricSettings())), "alpha", lambda _: None, ABOUT)
+    watch = ProxyWatch(
+        cast("FabricSession", SimpleNamespace(settings=FabricSettings())), "alpha", lambda _: None, ABOUT
+    )
     watch._runs = runs
     found = watch.find(0.0, 0.5)
     assert found == ([(RUN, ABOUT)] if runs == {RUN} else [(min(runs), None)])
@@ -112,7 +116,12 @@ def test_a_silent_node_soon_gets_another_session_and_more_time_each_turn(
     reached = True
 
     def connection(
-        session: Session, _name: str, _handler: object, _find_s: float, list_s: float, known: packets.ProxyInfo | None
+        session: FabricSession,
+        _name: str,
+        _handler: object,
+        _find_s: float,
+        list_s: float,
+        known: packets.ProxyInfo | None,
     ) -> Any:
         given.append(list_s)
         assert known == (ABOUT if len(given) > 1 else None), "it is not asked for its description again"

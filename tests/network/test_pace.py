@@ -14,7 +14,7 @@ from skyloop.network.admission import Admission
 from skyloop.network.connection import Publisher, ServerConnection
 from skyloop.network.delivery import ACKNOWLEDGE_AFTER, SLOW_S, STANDS_S, AckPolicy, Pace
 from skyloop.network.sealing import PLAIN
-from skyloop.network.session import Session
+from skyloop.network.session import FabricSession
 from skyloop.transport.base import EVENTS, FEEDBACK, Peer
 
 PERIOD_S = 1 / 32
@@ -27,7 +27,7 @@ class Scene:
         self.now_s = 100.0
         self.sent: list[tuple[str, int]] = []  # key and number
         self.publisher = Publisher("alpha", "1" * 16, PLAIN, lambda: self.now_s)
-        self.publisher.open(cast("Session", SimpleNamespace(publisher=self._declare)), lambda _: "")
+        self.publisher.open(cast("FabricSession", SimpleNamespace(publisher=self._declare)), lambda _: "")
         self._subscribers: dict[ServerConnection, tuple[AckPolicy, list[tuple[float, int]]]] = {}
         self.standing: set[ServerConnection] = set()
 

@@ -17,7 +17,7 @@ from skyloop.network.config import free_port
 from skyloop.network.connection import Publisher
 from skyloop.network.delivery import Outgoing
 from skyloop.network.sealing import PLAIN
-from skyloop.network.session import Session, release
+from skyloop.network.session import FabricSession, release
 from skyloop.transport.base import FEEDBACK, Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
@@ -40,7 +40,7 @@ def test_after_an_unannounced_end_another_session_is_used() -> None:
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
     dialer = dial("alpha", FabricSettings(connect=settings.listen, multicast=False))
 
-    def serve_once(session: Session | None) -> Session:
+    def serve_once(session: FabricSession | None) -> FabricSession:
         server, log = FabricServer("alpha", settings), ClientLog()
         server.start(ServerLog())
         try:
@@ -66,9 +66,9 @@ def test_after_an_unannounced_end_another_session_is_used() -> None:
 def test_a_failed_start_leaves_neither_session_nor_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """The network refused a declaration, and the session stayed open with its threads."""
     settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
-    released: list[Session] = []
+    released: list[FabricSession] = []
 
-    def counted(session: Session, *, linger: bool) -> None:
+    def counted(session: FabricSession, *, linger: bool) -> None:
         released.append(session)
         release(session, linger=linger)
 

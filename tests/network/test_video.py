@@ -11,7 +11,7 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
 from skyloop.messages.subscription import VideoRequest
-from skyloop.network.frames import LOST_NS, WINDOW, FramePublisher, Variant
+from skyloop.network.frames import LOST_NS, WINDOW, FramePublisher, FrameVariant
 from skyloop.transport import frame_encoding
 from skyloop.transport.testing import header, picture, wait_until
 
@@ -34,7 +34,7 @@ class Network:
         self.video = FramePublisher(self.send, "alpha", self.clock)
 
     def send(
-        self, variant: Variant, number: int, head: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
+        self, variant: FrameVariant, number: int, head: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
         self.gate.wait(5.0)
         assert len(data) == head.size
@@ -140,7 +140,7 @@ def test_without_an_encoder_frames_are_sent_unencoded_and_that_is_logged_once(
 def test_a_failed_send_costs_one_frame(caplog: pytest.LogCaptureFixture) -> None:
     sent: list[int] = []
 
-    def send(variant: Variant, number: int, head: FrameHeader, data: bytes, to: object) -> None:
+    def send(variant: FrameVariant, number: int, head: FrameHeader, data: bytes, to: object) -> None:
         if head.seq == 0:
             raise OSError("on purpose")
         sent.append(head.seq)

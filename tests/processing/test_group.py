@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyloop.processing.group import USAGE_ERROR, Group
+from skyloop.processing.group import USAGE_ERROR, ProcessGroup
 from skyloop.processing.worker import Status
 from skyloop.transport.testing import wait_until
 
@@ -25,7 +25,7 @@ def command(code: str) -> list[str]:
     return [sys.executable, "-c", code]
 
 
-def total(group: Group) -> int:
+def total(group: ProcessGroup) -> int:
     status = group.status
     return 0 if status is None else status.results
 
@@ -36,7 +36,7 @@ def gone(pid: int) -> bool:
 
 def test_children_are_summed_restarted_and_ended() -> None:
     told: list[str] = []
-    with Group(command(WORKS), 2, told.append, pause_s=0.01) as group:
+    with ProcessGroup(command(WORKS), 2, told.append, pause_s=0.01) as group:
         wait_until(lambda: total(group) == 6, "both have told how they do")
         before = group.pids
         os.kill(before[0], signal.SIGKILL)
@@ -48,7 +48,7 @@ def test_children_are_summed_restarted_and_ended() -> None:
 
 def test_an_exit_code_is_reported() -> None:
     told: list[str] = []
-    with Group(command("raise SystemExit(3)"), 1, told.append, pause_s=0.01) as group:
+    with ProcessGroup(command("raise SystemExit(3)"), 1, told.append, pause_s=0.01) as group:
         wait_until(lambda: group.code is None and len(told) >= 2, "it failed again and again")
     assert "ended with exit code 3" in told[0]
 
@@ -64,7 +64,7 @@ def test_it_ends_when_all_have_ended_or_one_can_never_work(tmp_path: Path, codes
         "    except FileNotFoundError:\n        continue\n"
         "    sys.exit(int(path.name[2:]))\n"
     )
-    with Group(command(takes_one), 2, print) as group:
+    with ProcessGroup(command(takes_one), 2, print) as group:
         wait_until(lambda: group.code is not None, "they ended")
         assert group.code == end
 
@@ -73,7 +73,7 @@ def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("skyloop.processing.group.GRACE_S", 0.05)
     deaf = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
     stubborn = f"{deaf}print({LINE!r}, flush=True)\ntime.sleep(60)"
-    with Group(command(stubborn), 1, print) as group:
+    with ProcessGroup(command(stubborn), 1, print) as group:
         wait_until(lambda: total(group) == 3, "it runs")
         [pid] = group.pids
     assert gone(pid)

@@ -12,7 +12,7 @@ import pytest
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Event, EventKind, FlightState, Land, ReleaseAuthority, RequestAuthority, Takeoff, Value
 from skyloop.proxy import Proxy
-from skyloop.proxy.records import AuditTrail, Entry, Tenure, audit_path, entry_of, read, tenures
+from skyloop.proxy.records import AuditEntry, AuditTrail, Tenure, audit_path, entry_of, read, tenures
 from skyloop.proxy.serve import keep_trail
 from skyloop.transport.local import LocalServer
 from tests.support.proxy_bench import Bench, FakeDriver
@@ -20,15 +20,15 @@ from tests.support.proxy_bench import Bench, FakeDriver
 NOON = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 
 
-def entry(kind: EventKind, app: str | None = None, text: str = "", **data: Value) -> Entry | None:
+def entry(kind: EventKind, app: str | None = None, text: str = "", **data: Value) -> AuditEntry | None:
     return entry_of(Event(kind, text, 0, app=app, data=data), NOON, "alpha", "r1")
 
 
 def test_lines_for_events() -> None:
     granted = entry(EventKind.AUTHORITY_GRANTED, "alice", app_id=1, priority=4, lease=2, identity="pid 9")
-    assert granted == Entry(NOON, "alpha", "r1", "granted", "alice", "pid 9", 2, 4)
+    assert granted == AuditEntry(NOON, "alpha", "r1", "granted", "alice", "pid 9", 2, 4)
     lost = entry(EventKind.AUTHORITY_LOST, "alice", app_id=1, lease=2, reason="silent", by="")
-    assert lost == Entry(NOON, "alpha", "r1", "ended", "alice", lease=2, how="silent")
+    assert lost == AuditEntry(NOON, "alpha", "r1", "ended", "alice", lease=2, how="silent")
     taken = entry(EventKind.AUTHORITY_PREEMPTED, "alice", lease=2, by="bob", granted=False)
     assert taken is not None
     assert taken.how == "taken over by bob"
@@ -36,8 +36,8 @@ def test_lines_for_events() -> None:
     assert given is not None
     assert given.how == "handed over to bob"
     stopped = entry(EventKind.EMERGENCY, "bob", "emergency stop by bob")
-    assert stopped == Entry(NOON, "alpha", "r1", "emergency", "bob", how="emergency stop by bob")
-    assert entry(EventKind.PROXY_CLOSING, None, "it ends") == Entry(NOON, "alpha", "r1", "end", how="it ends")
+    assert stopped == AuditEntry(NOON, "alpha", "r1", "emergency", "bob", how="emergency stop by bob")
+    assert entry(EventKind.PROXY_CLOSING, None, "it ends") == AuditEntry(NOON, "alpha", "r1", "end", how="it ends")
     assert entry(EventKind.BATTERY_LOW, battery=0.1) is None
 
 
@@ -63,20 +63,20 @@ def test_which_changes_count_as_a_take_off(before: str, after: Value, what: str 
 def test_the_table() -> None:
     at = [NOON + timedelta(minutes=minute) for minute in range(12)]
     lines = [
-        Entry(at[0], "alpha", "r1", "begin", how="sim://"),
-        Entry(at[1], "alpha", "r1", "granted", "alice", "pid 9", 1, 16),
-        Entry(at[1], "bravo", "x1", "takeoff"),  # before anyone held it
-        Entry(at[2], "alpha", "r1", "takeoff"),
-        Entry(at[2], "bravo", "x1", "granted", "carol", "pid 7", 1, 0),
-        Entry(at[3], "alpha", "r1", "landed"),
-        Entry(at[4], "alpha", "r1", "takeoff"),
-        Entry(at[5], "alpha", "r1", "ended", "alice", lease=1, how="taken over by bob"),
-        Entry(at[5], "alpha", "r1", "granted", "bob", "pid 8", 2, 4),
-        Entry(at[6], "alpha", "r1", "end", how="it ends"),
-        Entry(at[7], "alpha", "r2", "begin"),
-        Entry(at[8], "alpha", "r2", "granted", "alice", "pid 9", 1, 16),
-        Entry(at[9], "alpha", "r3", "begin"),
-        Entry(at[10], "alpha", "r3", "granted", "dave", "pid 6", 1, 16),
+        AuditEntry(at[0], "alpha", "r1", "begin", how="sim://"),
+        AuditEntry(at[1], "alpha", "r1", "granted", "alice", "pid 9", 1, 16),
+        AuditEntry(at[1], "bravo", "x1", "takeoff"),  # before anyone held it
+        AuditEntry(at[2], "alpha", "r1", "takeoff"),
+        AuditEntry(at[2], "bravo", "x1", "granted", "carol", "pid 7", 1, 0),
+        AuditEntry(at[3], "alpha", "r1", "landed"),
+        AuditEntry(at[4], "alpha", "r1", "takeoff"),
+        AuditEntry(at[5], "alpha", "r1", "ended", "alice", lease=1, how="taken over by bob"),
+        AuditEntry(at[5], "alpha", "r1", "granted", "bob", "pid 8", 2, 4),
+        AuditEntry(at[6], "alpha", "r1", "end", how="it ends"),
+        AuditEntry(at[7], "alpha", "r2", "begin"),
+        AuditEntry(at[8], "alpha", "r2", "granted", "alice", "pid 9", 1, 16),
+        AuditEntry(at[9], "alpha", "r3", "begin"),
+        AuditEntry(at[10], "alpha", "r3", "granted", "dave", "pid 6", 1, 16),
     ]
     assert tenures(lines) == [
         Tenure("alpha", "alice", "pid 9", 16, at[1], at[5], "taken over by bob", 2),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.geometry import wrap_angle
-from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
+from skyloop.proxy.core.autopilot import PERIOD_S, AutopilotSettings, SoftwareAutopilot, software_actions
 
 ATTITUDE = frozenset({"attitude"})
 GRAVITY = 9.81
@@ -61,15 +61,15 @@ class PointMass:
         )
 
 
-def fly(autopilot: Autopilot, mass: PointMass, seconds: float, *, position: bool = True) -> None:
+def fly(autopilot: SoftwareAutopilot, mass: PointMass, seconds: float, *, position: bool = True) -> None:
     for _ in range(round(seconds / PERIOD_S)):
         told = autopilot.step(mass.now_ns, mass.feedback(position=position))
         assert told is None or isinstance(told, Attitude)
         mass.step(told or Attitude(climb=-1.0))
 
 
-def taken_off(mass: PointMass) -> Autopilot:
-    autopilot = Autopilot(ATTITUDE)
+def taken_off(mass: PointMass) -> SoftwareAutopilot:
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), mass.now_ns, mass.feedback())
     fly(autopilot, mass, 6.0)
     return autopilot
@@ -95,7 +95,7 @@ def test_it_adds_actions_that_set_points_can_emulate(native: set[str], added: se
     [(Velocity(1.0), 0, 1), (Velocity(-1.0), 0, -1), (Velocity(left=1.0), -1, 0), (Velocity(left=-1.0), 1, 0)],
 )
 def test_signs_follow_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int) -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     still = Feedback(captured_ns=0, velocity_m_s=(0.0, 0.0, 0.0))
     autopilot.start(wanted, 0, still)
     told = autopilot.step(0, still)
@@ -106,7 +106,7 @@ def test_signs_follow_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int)
 
 def test_take_off_hover_and_landing() -> None:
     mass = PointMass()
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
     autopilot.start(Takeoff(), mass.now_ns, mass.feedback())
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF
@@ -157,7 +157,7 @@ def test_hover_without_a_position_stays_level() -> None:
 
 
 def test_a_vehicle_with_velocities_gets_velocities() -> None:
-    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot = SoftwareAutopilot(frozenset({"velocity"}))
     feedback = Feedback(captured_ns=0, altitude_m=0.0)
     autopilot.start(Takeoff(), 0, feedback)
     assert autopilot.step(0, feedback) == Velocity(up=0.5)
@@ -167,7 +167,7 @@ def test_a_vehicle_with_velocities_gets_velocities() -> None:
 
 
 def test_without_data_it_stays_level_and_uses_time() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert autopilot.step(0, None) == Attitude(climb=0.5)
     assert autopilot.step(2 * NS_PER_S, None) == Attitude()
@@ -182,7 +182,7 @@ def test_without_data_it_stays_level_and_uses_time() -> None:
 
 
 def test_the_result_of_a_landing_without_an_altimeter_is_unknown() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
     heard = 0
     while autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDING:
@@ -196,7 +196,7 @@ def test_the_result_of_a_landing_without_an_altimeter_is_unknown() -> None:
 @pytest.mark.parametrize("shown", [FlightState.UNKNOWN, FlightState.FLYING])
 def test_a_gap_in_the_feedback_ends_no_landing(shown: FlightState) -> None:
     """Late in a long landing, nothing is received for 0.6 s, or for a minute."""
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
     now = 0
     for gap_s in (0.6, 60.0):
@@ -214,7 +214,7 @@ def test_a_gap_in_the_feedback_ends_no_landing(shown: FlightState) -> None:
 
 def test_a_landing_over_lower_ground_ends_when_the_vehicle_reports_it() -> None:
     """Its altimeter counts from where it took off, 2 m higher."""
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Land(), 0, None)
     now = 0
     for below in range(100):
@@ -232,7 +232,7 @@ def test_a_landing_over_lower_ground_ends_when_the_vehicle_reports_it() -> None:
 
 
 def test_reports_from_before_do_not_end_a_landing_right_after_a_take_off() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
     autopilot.start(Land(), 2 * STEP_NS, None)
@@ -245,7 +245,7 @@ def test_reports_from_before_do_not_end_a_landing_right_after_a_take_off() -> No
 @pytest.mark.parametrize("position", [True, False])
 def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
     """It is stuck at zero: the position shows the height, otherwise the time."""
-    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot = SoftwareAutopilot(frozenset({"velocity"}))
     autopilot.start(Takeoff(), 0, None)
     height, now = 0.0, 0
     while autopilot.flight.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF:
@@ -262,7 +262,7 @@ def test_a_take_off_ends_without_the_altimeter(position: bool) -> None:
 
 def test_a_take_off_that_has_not_risen_in_time_lands() -> None:
     """Seen with a real Betaflight short of computing time: it was reported as hovering, at 0.04 m."""
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     now = 0
     while autopilot.flight.state(FlightState.FLYING) is FlightState.TAKING_OFF:
@@ -276,7 +276,7 @@ def test_a_take_off_that_has_not_risen_in_time_lands() -> None:
 
 
 def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimeter() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     for step in range(1, 400):
         assert seen(autopilot, FlightState.LANDED, step * STEP_NS, 1.2) == Attitude(climb=0.5)
@@ -287,7 +287,7 @@ def test_a_vehicle_that_reports_to_stand_has_not_taken_off_whatever_its_altimete
 
 def test_a_vehicle_found_on_the_ground_after_a_gap_stays_there() -> None:
     """A flight controller stalled for a while, and its vehicle fell."""
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     now = 0
     autopilot.start(Hover(), now, Feedback(captured_ns=0, altitude_m=1.0))
     heard = Feedback(captured_ns=0, altitude_m=1.0)
@@ -302,7 +302,7 @@ def test_a_vehicle_found_on_the_ground_after_a_gap_stays_there() -> None:
 
 
 def test_stale_feedback_is_not_used() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     old = Feedback(captured_ns=0, velocity_m_s=(3.0, 3.0, 0.0))
     autopilot.start(Hover(), 0, old)
     assert autopilot.step(NS_PER_S // 2, old) != Attitude()
@@ -310,7 +310,7 @@ def test_stale_feedback_is_not_used() -> None:
 
 
 def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     for step in range(200):
         now = step * STEP_NS
         feedback = Feedback(captured_ns=now, altitude_m=max(0.25, 1.0 - 0.4 * step * PERIOD_S))
@@ -335,7 +335,7 @@ def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
 def test_the_vehicles_own_report_counts_if_it_has_one(
     native: set[str], mode: Takeoff | Hover | Land | Velocity, told: FlightState, expected: FlightState
 ) -> None:
-    autopilot = Autopilot(frozenset(native))
+    autopilot = SoftwareAutopilot(frozenset(native))
     autopilot.start(mode, 0, None)
     assert autopilot.flight.state(told) is expected
 
@@ -350,7 +350,7 @@ def test_the_vehicles_own_report_counts_if_it_has_one(
     ],
 )
 def test_the_vehicles_own_actions_stop_the_autopilot(action: str, expected: FlightState) -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Hover(), 0, None)
     autopilot.stop(action)
     assert autopilot.step(0, None) is None
@@ -358,20 +358,20 @@ def test_the_vehicles_own_actions_stop_the_autopilot(action: str, expected: Flig
 
 
 def test_an_attitude_on_the_ground_is_not_a_flight() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.stop("attitude")
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
 
 
 def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=0.1))
     autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED, "it drifts"
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.flight.observe(FlightState.LANDED, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.LANDED
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0))
     autopilot.flight.observe(FlightState.UNKNOWN, "", 0, Feedback(captured_ns=0, altitude_m=1.0))
     assert autopilot.flight.state(FlightState.UNKNOWN) is FlightState.FLYING
@@ -399,7 +399,7 @@ def test_it_never_tilts_beyond_the_limit_whatever_the_feedback(
         ]
     ],
 ) -> None:
-    autopilot = Autopilot(ATTITUDE, AutopilotSettings(tilt=0.2))
+    autopilot = SoftwareAutopilot(ATTITUDE, AutopilotSettings(tilt=0.2))
     now = 0
     for action, altitude, velocity, position in heard:
         now += STEP_NS
@@ -464,7 +464,7 @@ def test_the_path_is_straight_and_within_its_speeds(
     speed: float,
     yaw_rate: float,
 ) -> None:
-    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot = SoftwareAutopilot(frozenset({"velocity"}))
     feedback = Feedback(captured_ns=0, yaw_rad=heading, position_m=place)
     autopilot.start(Position(*target, yaw, speed, yaw_rate), 0, feedback)
     told = autopilot.step(0, feedback)
@@ -486,7 +486,7 @@ def test_the_path_is_straight_and_within_its_speeds(
     ids=["no position", "no yaw", "old"],
 )
 def test_it_stops_while_its_position_is_unknown(lacking: dict[str, object]) -> None:
-    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot = SoftwareAutopilot(frozenset({"velocity"}))
     known: dict[str, object] = {"captured_ns": 0, "yaw_rad": 0.0, "position_m": (0.0, 0.0, 1.0)}
     autopilot.start(Position(5.0, 0.0, 1.0), 0, Feedback(**known))  # type: ignore[arg-type]
     assert autopilot.step(0, Feedback(**known)) == Velocity(forward=1.0)  # type: ignore[arg-type]
@@ -495,7 +495,7 @@ def test_it_stops_while_its_position_is_unknown(lacking: dict[str, object]) -> N
 
 
 def test_forbidden_velocities_are_not_flown() -> None:
-    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot = SoftwareAutopilot(frozenset({"velocity"}))
     autopilot.guard = lambda wanted, _feedback, _now_ns: Velocity(up=wanted.up)
     feedback = Feedback(captured_ns=0, yaw_rad=0.0, position_m=(0.0, 0.0, 1.0))
     autopilot.start(Position(5.0, 0.0, 1.1), 0, feedback)
@@ -508,12 +508,14 @@ def test_forbidden_velocities_are_not_flown() -> None:
 # A vehicle that reports whether it is on the ground -------------------------------------------------------------------
 
 
-def seen(autopilot: Autopilot, state: FlightState, now_ns: int, altitude_m: float) -> Attitude | Velocity | None:
+def seen(
+    autopilot: SoftwareAutopilot, state: FlightState, now_ns: int, altitude_m: float
+) -> Attitude | Velocity | None:
     return autopilot.step(now_ns, Feedback(captured_ns=now_ns, altitude_m=altitude_m), state)
 
 
 def test_a_vehicle_disarmed_in_the_air_is_no_longer_flown() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, STEP_NS, 0.0) is not None, "it is about to rise"
     seen(autopilot, FlightState.FLYING, 2 * STEP_NS, 1.0)
@@ -524,7 +526,7 @@ def test_a_vehicle_disarmed_in_the_air_is_no_longer_flown() -> None:
 
 
 def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     assert seen(autopilot, FlightState.LANDED, 14 * NS_PER_S, 0.0) is not None
     assert seen(autopilot, FlightState.LANDED, 15 * NS_PER_S, 0.0) == Attitude(), "no climb stays in force"
@@ -535,7 +537,7 @@ def test_a_take_off_that_never_leaves_the_ground_ends() -> None:
 @pytest.mark.parametrize("action", [Hover(), Velocity(0.5)])
 def test_steering_on_the_ground_without_a_take_off_ends(action: Hover | Velocity) -> None:
     """It was disarmed when the software started to steer it: an upward velocity would arm it again."""
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(action, 0, None)
     seen(autopilot, FlightState.LANDED, STEP_NS, 0.0)
     assert autopilot.flight.state(FlightState.LANDED).airborne, "its driver may not know yet"
@@ -545,7 +547,7 @@ def test_steering_on_the_ground_without_a_take_off_ends(action: Hover | Velocity
 
 
 def test_a_refusal_ends_a_take_off_but_no_flight() -> None:
-    autopilot = Autopilot(ATTITUDE)
+    autopilot = SoftwareAutopilot(ATTITUDE)
     autopilot.start(Takeoff(), 0, None)
     autopilot.refused(FlightState.UNKNOWN)
     autopilot.refused(FlightState.FLYING)

@@ -14,7 +14,7 @@ from skyloop.messages import CameraInfo, Capabilities, Encoding, FrameHeader
 from skyloop.messages.frame import H264
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import VERSION, ClockPair, DroneRecord, End, FrameRecord, Start, to_plain
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import TranslatedImage, Translator
 from skyloop.recording.writer import RecordingFile
 from skyloop.vehicles.emulation.video import Encoder, Format
 
@@ -77,7 +77,7 @@ def write_film(path: Path, units: Iterable[Unit], *, closed: bool = True) -> Pat
             size,
         )
         at_ns = unit.received_ns or unit.captured_ns + 2 * MS
-        picture = Picture(FrameRecord(header, at_ns, unit.format, unit.key), unit.data)
+        picture = TranslatedImage(FrameRecord(header, at_ns, unit.format, unit.key), unit.data)
         for message in translator.messages(Item(0, "video.front", Rank.FRAME, at_ns, picture, len(unit.data))):
             file.write(message)
         if n % GROUP == GROUP - 1:

@@ -26,7 +26,7 @@ from skyloop.proxy.proxy import Proxy
 from skyloop.recording import layout, taps
 from skyloop.recording.layout import FrameRecord
 from skyloop.recording.options import Options
-from skyloop.recording.pictures import Group, Groups
+from skyloop.recording.pictures import FrameGroup, Groups
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
@@ -251,7 +251,7 @@ def test_images_that_depend_on_missing_or_damaged_ones_are_not_shown() -> None:
     whole = [n for n in range(1, 40) if n != 18]
     lost = [n for n, place in zip(whole, found, strict=True) if place is None]
     assert lost == [*range(1, 15), *range(19, 30)]  # keys are 0, 15, 30
-    group = Group()
+    group = FrameGroup()
     for n, frame in enumerate(sent()[:5]):
         group.add(frame.payload[: len(frame.payload) // 2] if n == 2 else frame.payload)
     assert np.array_equal(group.pixels(1, "it"), shown()[1])

@@ -38,7 +38,7 @@ from skyloop.recording.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import export_csv, export_npz, export_parquet, read
-from skyloop.recording.translation import Message, Picture, Translator
+from skyloop.recording.translation import Message, TranslatedImage, Translator
 from skyloop.recording.writer import RecordingFile
 from skyloop.vehicles.replay.player import Playback, StepPlayer
 from skyloop.vehicles.replay.source import ReplaySource
@@ -131,7 +131,7 @@ def write(path: Path, sample: Any) -> Recording:
     for number, one in enumerate(written):
         clock_ns += 5_000_000
         if isinstance(one, FrameRecord):
-            one = Picture(one, jpeg())
+            one = TranslatedImage(one, jpeg())
         if isinstance(one, ResultRecord):  # it is made from a packed result, which has its own tests
             topic = f"/alpha/{Channel.RESULTS}"
             file.write(Message(topic, ResultRecord, layout.encode(one), CLOCK.unix(clock_ns), CLOCK.unix(clock_ns)))

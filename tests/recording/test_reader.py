@@ -17,8 +17,8 @@ from mcap.writer import CompressionType, Writer
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
 from skyloop.recording.layout import Channel, image_topic
-from skyloop.recording.pictures import Picture, decode_image
-from skyloop.recording.plain import Course, reported_ns, shifted
+from skyloop.recording.pictures import RecordedImage, decode_image
+from skyloop.recording.plain import TimeCourse, reported_ns, shifted
 from skyloop.recording.reader import Item, Recording
 from skyloop.recording.review.tables import tables
 from skyloop.vehicles.replay.source import ReplaySource
@@ -92,7 +92,7 @@ def test_images_are_decoded(tmp_path: Path, png: bool) -> None:
 
 def test_images_and_samples_together(flight: Path) -> None:
     found = list(Recording.open(flight).items_and_pictures("alpha", (Channel.FRAMES, Channel.EVENTS)))
-    assert sum(isinstance(one, Picture) for one in found) == 20
+    assert sum(isinstance(one, RecordedImage) for one in found) == 20
     assert {one.channel for one in found if isinstance(one, Item)} == {Channel.EVENTS}
 
 
@@ -151,7 +151,7 @@ def test_damage_only_removes_samples(
     with contextlib.suppress(FileFormatError):
         recording = Recording.open(path)
         for one in recording.items_and_pictures(recording.drone().name, tuple(Channel)):
-            if isinstance(one, Picture):
+            if isinstance(one, RecordedImage):
                 one.pixels()
 
 
@@ -227,7 +227,7 @@ def feedback(ms: int) -> Feedback:
 
 
 def test_a_course_never_runs_backwards_and_ignores_wrong_times() -> None:
-    course = Course()
+    course = TimeCourse()
     parameter = Parameter("a", ParameterType.FLOAT, 1.0)
     assert reported_ns(parameter) is None
     assert course.follow(parameter) == 0
@@ -239,7 +239,7 @@ def test_a_course_never_runs_backwards_and_ignores_wrong_times() -> None:
 
 def test_a_course_continues_when_the_proxys_computer_reboots() -> None:
     """Its clock restarts: the rest of the flight had no time, and 60 s became a point."""
-    course = Course()
+    course = TimeCourse()
     flight = [(10**8 + 20 * step, 20 * step) for step in range(100)]
     flight += [(30_000 + 20 * step, 62_000 + 20 * step) for step in range(100)]  # 60 s later by the recorder's clock
     times = [course.follow(feedback(own), log * 1_000_000 + 1) // 1_000_000 - 10**8 for own, log in flight]
@@ -280,7 +280,7 @@ def test_a_flight_whose_proxy_rebooted_is_replayed_and_exported_whole(
 
 
 def test_times_of_applications_do_not_restart_the_clock() -> None:
-    course = Course()
+    course = TimeCourse()
     assert course.follow(feedback(10**6)) == 10**12
     for _ in range(5):
         assert course.follow(LogEntry("me", "x", 1000, number=1.0)) == 10**12
@@ -289,7 +289,7 @@ def test_times_of_applications_do_not_restart_the_clock() -> None:
 
 
 def test_a_course_continues_after_a_long_pause() -> None:
-    course = Course()
+    course = TimeCourse()
     hours = 5 * 3600 * 1000
     steps = [feedback(1000), feedback(hours), feedback(hours + 20), feedback(hours + 40)]
     assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1000, hours + 20, hours + 40]

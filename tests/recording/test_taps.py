@@ -18,7 +18,7 @@ from skyloop.recording.layout import ClockPair, DroneRecord, FrameRecord, to_pla
 from skyloop.recording.options import MB, Options
 from skyloop.recording.reader import Recording
 from skyloop.recording.taps import Stream
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.translation import TranslatedImage, Translator
 from skyloop.recording.writer import FileWriter
 from tests.recording.streams import CAPABILITIES, Unit, film
 
@@ -142,7 +142,7 @@ def test_any_kept_frames_can_be_decoded(order: list[int]) -> None:
     rig.send(*(film()[n] for n in order))
     last: int | None = None
     for item in rig.items:
-        assert isinstance(item.sample, Picture)
+        assert isinstance(item.sample, TranslatedImage)
         record: FrameRecord = item.sample.record
         assert record.key or (last is not None and record.header.seq == last + 1)
         last = record.header.seq

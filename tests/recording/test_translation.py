@@ -23,7 +23,7 @@ from skyloop.messages.relayed import pack
 from skyloop.recording import layout
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, ResultRecord
-from skyloop.recording.translation import Message, Path, Picture, Translator
+from skyloop.recording.translation import Message, Trail, TranslatedImage, Translator
 from tests.support.samples import CAMERA
 
 UNIX = 1_000_000_000_000_000_000
@@ -43,9 +43,9 @@ def topics(found: list[Message]) -> list[str]:
     return [message.topic for message in found]
 
 
-def picture(seq: int, intrinsics: Intrinsics | None, width: int = 4) -> Picture:
+def picture(seq: int, intrinsics: Intrinsics | None, width: int = 4) -> TranslatedImage:
     header = FrameHeader("front", seq, seq + AHEAD_NS, seq, width, 3, Encoding.JPEG, 7, intrinsics)
-    return Picture(FrameRecord(header, seq, "jpeg"), b"picture")
+    return TranslatedImage(FrameRecord(header, seq, "jpeg"), b"picture")
 
 
 def test_capture_is_on_the_proxys_clock_and_receiving_on_ours() -> None:
@@ -135,7 +135,7 @@ def test_the_path_is_written_once_a_second_and_only_with_positions() -> None:
 
 
 def test_a_long_path_is_thinned_out_evenly() -> None:
-    path = Path()
+    path = Trail()
     for place in range(10_000):
         path.add(place)
     assert len(path.places) <= 400

@@ -26,8 +26,8 @@ from skyloop.messages import (
 from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
-from skyloop.recording.options import MB, Options, Room, judge_room
-from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.options import MB, DiskRoom, Options, judge_room
+from skyloop.recording.translation import TranslatedImage, Translator
 from skyloop.recording.writer import FileWriter
 from tests.recording.disks import Disk
 from tests.support import recording_files as files
@@ -66,7 +66,7 @@ class Bench:
     def frames(self, *numbers: int, size: int = 1000) -> None:
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
-            picture = Picture(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
+            picture = TranslatedImage(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
 
     def pictures(self, *numbers: int, size: int = 1000, group: int = 10) -> None:
@@ -74,7 +74,7 @@ class Bench:
         for number in numbers:
             header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
             record = FrameRecord(header, number, "h264", number % group == 0)
-            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, Picture(record, bytes(size)), size))
+            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, TranslatedImage(record, bytes(size)), size))
 
     def step(self, seconds: float = 1.0) -> None:
         """Advance by a second, after which everything is due."""
@@ -326,7 +326,7 @@ def test_the_floor_stops_frames_first_then_all_until_there_is_room(make: Make, t
     assert files.is_complete(bench.path), "there was room to close the file"
     bench.disk.room = 45 * MB  # above the floor, but not by the margin
     bench.step()
-    assert bench.writer.room is Room.NO_FRAMES
+    assert bench.writer.room is DiskRoom.NO_FRAMES
     bench.disk.room = 60 * MB
     bench.step()
     bench.frames(4)
@@ -347,18 +347,18 @@ def test_the_floor_stops_frames_first_then_all_until_there_is_room(make: Make, t
 @pytest.mark.parametrize(
     ("free", "before", "after"),
     [
-        (100, Room.ALL, Room.ALL),
-        (99, Room.ALL, Room.NO_FRAMES),
-        (24, Room.ALL, Room.NOTHING),
-        (124, Room.NO_FRAMES, Room.NO_FRAMES),
-        (125, Room.NO_FRAMES, Room.ALL),
-        (24, Room.NO_FRAMES, Room.NOTHING),
-        (31, Room.NOTHING, Room.NOTHING),
-        (32, Room.NOTHING, Room.NO_FRAMES),
-        (200, Room.NOTHING, Room.ALL),
+        (100, DiskRoom.ALL, DiskRoom.ALL),
+        (99, DiskRoom.ALL, DiskRoom.NO_FRAMES),
+        (24, DiskRoom.ALL, DiskRoom.NOTHING),
+        (124, DiskRoom.NO_FRAMES, DiskRoom.NO_FRAMES),
+        (125, DiskRoom.NO_FRAMES, DiskRoom.ALL),
+        (24, DiskRoom.NO_FRAMES, DiskRoom.NOTHING),
+        (31, DiskRoom.NOTHING, DiskRoom.NOTHING),
+        (32, DiskRoom.NOTHING, DiskRoom.NO_FRAMES),
+        (200, DiskRoom.NOTHING, DiskRoom.ALL),
     ],
 )
-def test_room_is_judged_with_a_margin(free: int, before: Room, after: Room) -> None:
+def test_room_is_judged_with_a_margin(free: int, before: DiskRoom, after: DiskRoom) -> None:
     assert judge_room(free, 100, before) is after
 
 

@@ -18,7 +18,7 @@ from skyloop.errors import MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import EmergencyStop, FlightState, Position, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.ros import Bridge, Settings
-from skyloop.ros.names import Frames, namespaces_of, tf_message_type
+from skyloop.ros.names import FrameNames, namespaces_of, tf_message_type
 from skyloop.transport.memory import MemoryServer
 from skyloop.vehicles.ros2.node import (
     DISCOVERY_VARIABLES,
@@ -100,7 +100,7 @@ def test_a_vehicle_that_knows_its_position(rig: Rig) -> None:
     from skyloop.messages import Feedback, LinkState
     from skyloop.messages.feedback import EarthOrigin
     from skyloop.ros.names import RosTime
-    from skyloop.ros.telemetry import Telemetry
+    from skyloop.ros.telemetry import RosTelemetry
 
     quiet = SimpleNamespace(
         on_feedback=lambda function: None,
@@ -108,7 +108,7 @@ def test_a_vehicle_that_knows_its_position(rig: Rig) -> None:
         capabilities=SimpleNamespace(cameras=()),
     )
     node: Any = Node("one", "", [])
-    telemetry = Telemetry(node, quiet, RosTime(node, quiet), Frames("one"))  # type: ignore[arg-type]
+    telemetry = RosTelemetry(node, quiet, RosTime(node, quiet), FrameNames("one"))  # type: ignore[arg-type]
     known = Feedback(
         captured_ns=4 * 10**9,
         state=FlightState.FLYING,
@@ -241,7 +241,7 @@ def test_velocities_do_not_end_a_landing(rig: Rig) -> None:
     )
     topics: Any = Node("topics", "", [])
     services: Any = Node("services", "", [])
-    pilot = Pilot(topics, services, drone, None, Frames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
+    pilot = Pilot(topics, services, drone, None, FrameNames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
     waiting = threading.Thread(target=services.call, args=("land",))
     waiting.start()
     assert landing.wait(WAIT_S)
@@ -276,7 +276,7 @@ def test_a_velocity_that_was_checked_before_a_landing_is_sent_before_it(rig: Rig
     )
     topics: Any = Node("topics", "", [])
     services: Any = Node("services", "", [])
-    Pilot(topics, services, drone, None, Frames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
+    Pilot(topics, services, drone, None, FrameNames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
     flying = threading.Thread(target=topics.subscriptions["cmd_vel"], args=(twist(x=0.5),))
     flying.start()
     assert sending.wait(WAIT_S)
@@ -345,7 +345,7 @@ def test_goals_are_positions_with_a_heading(rig: Rig) -> None:
     )
     topics: Any = Node("topics", "", [])
     services: Any = Node("services", "", [])
-    Pilot(topics, services, drone, None, Frames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
+    Pilot(topics, services, drone, None, FrameNames("one"), priority=None, timeout_s=0.5)  # type: ignore[arg-type]
     topics.subscriptions["goal_pose"](goal(1.0, 2.0, 0.0, "one/odom", yaw=1.0))
     assert flown[0] == {"x": 1.0, "y": 2.0, "z": 1.2, "yaw": pytest.approx(1.0), "wait": False}
     topics.subscriptions["goal_pose"](goal(1.0, 2.0, 3.0))
@@ -400,7 +400,7 @@ def test_names_that_ros_allows() -> None:
     assert ros_name("drone-3") == "drone_3"
     assert ros_name("3") == "drone_3"
     assert namespaces_of(("alpha", "b.c")) == {"alpha": "alpha", "b.c": "b_c"}
-    assert Frames("alpha").optical("front") == "alpha/front_optical_frame"
+    assert FrameNames("alpha").optical("front") == "alpha/front_optical_frame"
 
 
 def test_domains() -> None:

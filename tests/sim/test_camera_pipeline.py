@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns
 from skyloop.messages.subscription import RateLimiter
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
-from skyloop.sim.camera_pipeline import Camera, CameraPipeline, Exposure, Shutter, expose
+from skyloop.sim.camera_pipeline import CameraPipeline, Exposure, PipelineCamera, Shutter, expose
 from skyloop.sim.render import SceneState
 from skyloop.sim.world_file import load_world
 from skyloop.transport.testing import wait_until
@@ -41,11 +41,11 @@ class Wall:
         self.told.set()
 
 
-def camera(screen: Wall) -> Camera:
-    return Camera(MODEL, 0, screen, seed=1, shutter=Shutter())
+def camera(screen: Wall) -> PipelineCamera:
+    return PipelineCamera(MODEL, 0, screen, seed=1, shutter=Shutter())
 
 
-def exposure(of: Camera, captured_ns: int) -> Exposure:
+def exposure(of: PipelineCamera, captured_ns: int) -> Exposure:
     return expose(of, STATE, np.zeros(3), captured_ns, speed=1.0)
 
 
@@ -94,14 +94,14 @@ def test_a_renderer_that_cannot_be_created_is_reported(monkeypatch: pytest.Monke
 
 
 def test_a_failed_frame_is_reported_and_the_next_one_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    finish, fail = Camera.finish, [True]
+    finish, fail = PipelineCamera.finish, [True]
 
-    def sometimes(self: Camera, *arguments: object) -> NDArray[np.uint8]:
+    def sometimes(self: PipelineCamera, *arguments: object) -> NDArray[np.uint8]:
         if fail.pop() if fail else False:
             raise RuntimeError("spilt ink")
         return finish(self, *arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Camera, "finish", sometimes)
+    monkeypatch.setattr(PipelineCamera, "finish", sometimes)
     wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "fast")
     front = camera(wall)
     with drawing(pipeline):

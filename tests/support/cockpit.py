@@ -17,13 +17,13 @@ import numpy as np
 
 from skyloop.client import Authority, Drone
 from skyloop.client.drone import open_drone
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
 from skyloop.cockpit.alarms import PARAMETERS, USUAL
 from skyloop.cockpit.app import create_app
-from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.discovery import FoundProxy
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import own_names
 from skyloop.drivers.base import Driver, Sink
@@ -195,7 +195,7 @@ class FakeDrone:
         self._seq += 1
         now = time.monotonic_ns()
         header = FrameHeader(camera, self._seq, captured_ns or now, now, width, height, Encoding.BGR8, pixels.size)
-        frame = Arrival(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
+        frame = ReceivedFrame(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
         for function in list(self.processors[camera]):
             function(frame)
         return frame
@@ -354,8 +354,8 @@ class Nodes:
         self.nodes = list(nodes)
         self.wanted: list[str] = []
 
-    def __call__(self) -> list[Found]:
-        return [Found(node.name, "memory", node.dial) for node in self.nodes if node.up]
+    def __call__(self) -> list[FoundProxy]:
+        return [FoundProxy(node.name, "memory", node.dial) for node in self.nodes if node.up]
 
     def add_name(self, name: str) -> None:
         self.wanted.append(name)
@@ -386,26 +386,26 @@ def this_user(role: Role = Role.PILOT) -> OpenGate:
     return OpenGate(role, uid_of=lambda *_: os.geteuid())
 
 
-def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
+def fake_fleet(drones: Mapping[str, FakeDrone]) -> CockpitFleet:
     """Return a fleet of drones that are found at once and never lost."""
 
     def dial(_: ClientHandler) -> TransportClient:
         raise LinkError("nobody flies this one")
 
     class Finder:
-        def __call__(self) -> list[Found]:
-            return [Found(name, "memory", dial) for name in drones]
+        def __call__(self) -> list[FoundProxy]:
+            return [FoundProxy(name, "memory", dial) for name in drones]
 
         def add_name(self, name: str) -> None: ...
 
         def close(self) -> None: ...
 
-    return Fleet(Finder(), lambda found: drones[found.name])  # type: ignore[arg-type,return-value]
+    return CockpitFleet(Finder(), lambda found: drones[found.name])  # type: ignore[arg-type,return-value]
 
 
 @contextmanager
 def cockpit(
-    fleet: Fleet, gate: Gate | None = None, recordings: Recordings | None = None, **options: Any
+    fleet: CockpitFleet, gate: Gate | None = None, recordings: Recordings | None = None, **options: Any
 ) -> Iterator[TestClient]:
     """Return the cockpit's pages without a server."""
     names = own_names("127.0.0.1", 8123)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.tracking_scenes import texture
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.clock import nanoseconds
 from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Encoding, Feedback, FrameHeader
@@ -46,7 +46,7 @@ def picture(
         history.add(state(at_s, **values))
     at_ns = nanoseconds(at_s)
     header = FrameHeader("front", 1, at_ns, at_ns, 320, 240, Encoding.BGR8, image.size, intrinsics)
-    return Arrival(header, image.reshape(-1), at_ns, 0, history).frame()
+    return ReceivedFrame(header, image.reshape(-1), at_ns, 0, history).frame()
 
 
 def the_box() -> Box:

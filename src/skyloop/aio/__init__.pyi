@@ -7,7 +7,7 @@ from skyloop.aio.bridge import Callback as Callback, Opening, T
 from skyloop.client.authority import Authority, AuthorityStatus, TakeoverAnswer, TakeoverRequest, TakeoverWay
 from skyloop.client.connect import ConnectOptions, NetworkChoice
 from skyloop.client.drone import Access
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.piloting import OnExit
 from skyloop.client.preflight import PreflightFinding
@@ -607,7 +607,7 @@ class Drone:
         depth: int = 1,
         inline: bool = False,
         **how: Unpack[VideoOptions],
-    ) -> client.Listener[Arrival]:
+    ) -> client.Listener[ReceivedFrame]:
         """Call ``function`` with the newest frame of a camera.
 
         Args:

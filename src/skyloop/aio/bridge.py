@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar, Unpack
 from skyloop import client
 from skyloop.client.channels import Mailbox, Notifier, checked_age
 from skyloop.client.commands import cancelled
-from skyloop.client.frame import Arrival
+from skyloop.client.frame import ReceivedFrame
 from skyloop.client.results import ResultMailbox, silence
 from skyloop.client.swarm import Tick
 from skyloop.client.video import VideoChannel, VideoOptions
@@ -299,7 +299,7 @@ class Drone:
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
         state, notifier, clock = self.sync._state, LoopNotifier(), asyncio.get_running_loop().time
-        channel, mailbox = state.follow(lambda: state.video.channel(camera, **how)), Mailbox[Arrival](notifier=notifier)
+        channel, mailbox = state.follow(lambda: state.video.channel(camera, **how)), Mailbox[ReceivedFrame](1, notifier)
         with state.closing(mailbox), channel.into(mailbox):
             deadline = clock() + timeout_s
             while not self.sync.closed:
@@ -327,10 +327,10 @@ class Drone:
                     deadline = clock() + timeout_s
 
 
-async def _decoded(channel: VideoChannel, arrival: Arrival | None, max_age_s: float | None) -> client.Frame | None:
-    if arrival is not None and arrival.header.encoding is Encoding.JPEG:
-        return await in_thread(lambda: channel.picture(arrival, max_age_s))
-    return None if arrival is None else channel.picture(arrival, max_age_s)
+async def _decoded(video: VideoChannel, frame: ReceivedFrame | None, max_age_s: float | None) -> client.Frame | None:
+    if frame is not None and frame.header.encoding is Encoding.JPEG:
+        return await in_thread(lambda: video.picture(frame, max_age_s))
+    return None if frame is None else video.picture(frame, max_age_s)
 
 
 @mirrors(

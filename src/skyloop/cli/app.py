@@ -58,19 +58,19 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
         shown: dict[str, Any] = {"short_help": entry.summary, "epilog": f"Example: skyloop {entry.example}"}
         if isinstance(function, typer.Typer):  # a command with subcommands
             for info in function.registered_commands:
-                info.cls = Command
-            app.add_typer(function, name=name, cls=Group, **shown)
+                info.cls = CliCommand
+            app.add_typer(function, name=name, cls=CliGroup, **shown)
             continue
-        kind = _with_behaviours(entry.behaviours) if entry.behaviours else Command
+        kind = _with_behaviours(entry.behaviours) if entry.behaviours else CliCommand
         app.command(name, cls=kind, context_settings=dict(entry.settings), **shown)(function)
     return app
 
 
-def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
+def _with_behaviours(entries: Mapping[str, Entry]) -> type[CliCommand]:
     """Return a command class that runs one of ``entries`` if that is the first word, as in ``skyloop fly follow``."""
     others = {name: _alone(name, each) for name, each in entries.items()}
 
-    class WithBehaviours(Command):
+    class WithBehaviours(CliCommand):
         def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
             other = others.get(args[0]) if args else None
             if other is None:
@@ -84,7 +84,7 @@ def _alone(name: str, entry: Entry) -> Any:
     """Return one command as a separate command line."""
     own = typer.Typer(add_completion=False, rich_markup_mode=None)
     function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
-    own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
+    own.command(name, cls=CliCommand, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
     return typer.main.get_command(own)
 
 
@@ -169,7 +169,7 @@ def width() -> int:
     return max(_NARROWEST, min(_WIDEST, shutil.get_terminal_size().columns) - 2)
 
 
-class Command(TyperCommand):
+class CliCommand(TyperCommand):
     """A command whose help shows its arguments as the user types them: ``NAME``, or ``[NAME]`` if optional.
 
     An argument's ``metavar`` is shown verbatim: NAME is optional for Typer, because ``--drone`` may be used instead.
@@ -182,7 +182,7 @@ class Command(TyperCommand):
         write_options(self, ctx, formatter)
 
 
-class Group(TyperGroup):
+class CliGroup(TyperGroup):
     """A command with subcommands; they are listed with their full summaries, wrapped if necessary."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
@@ -198,7 +198,7 @@ class Group(TyperGroup):
         write_sections(formatter, {"Commands": summaries})
 
 
-class ByTask(Group):
+class ByTask(CliGroup):
     """All commands in the order of the table, each created on demand."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  Typer's signature

@@ -89,7 +89,7 @@ def fly(
     authority = Authority(priority=priority, wait_s=wait)
     with connect_pilot(target, ADVICE, name=file.name[:64], authority=authority) as flown:
         controller = make(controller_class, flown)
-        worked = run(Flight(flown, controller, say), flown, seconds, reloader, takeoff=takeoff)
+        worked = run(ControllerFlight(flown, controller, say), flown, seconds, reloader, takeoff=takeoff)
         land(flown)
     if not worked:
         raise typer.Exit(1)
@@ -115,7 +115,7 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
 
 
 def run(
-    flight: Flight,
+    flight: ControllerFlight,
     drone: Drone,
     seconds: float | None,
     reloader: Reloader | None = None,
@@ -159,7 +159,7 @@ def say(text: str) -> None:
     typer.echo("\n".join(coloured(line, sys.stderr) for line in text.splitlines()), err=True)
 
 
-class Flight:
+class ControllerFlight:
     """Runs a connected drone's controller until it ends, and reloads it whenever the file is saved. Use only once."""
 
     def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
@@ -428,7 +428,7 @@ def fly_follow(
         )
         _check(flown, camera, given, loaded)
         progress = FlightProgress(flown, what=lambda: status_line(pilot), every_s=_LINE_EVERY_S)
-        worked = run(Flight(flown, pilot, say), flown, seconds, takeoff=takeoff, progress=progress)
+        worked = run(ControllerFlight(flown, pilot, say), flown, seconds, takeoff=takeoff, progress=progress)
         if pilot.done:
             say("the target was lost for too long")
         land(flown)

@@ -13,7 +13,7 @@ from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.host.fleet import Fleet
-    from skyloop.host.serve import Answer, Request
+    from skyloop.host.serve import HostAnswer, Request
     from skyloop.host.vehicle import VehicleStatus
 
 FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="File of vehicles; see docs/host.md")]
@@ -87,9 +87,9 @@ def status(
     group: GroupOption = None,
 ) -> None:
     """Show the vehicles of a running host: their states, their pilots, and the reason for any failure."""
-    from skyloop.host.serve import Status
+    from skyloop.host.serve import StatusRequest
 
-    rows = _ask(Status(), host, group).vehicles
+    rows = _ask(StatusRequest(), host, group).vehicles
     if json:
         print_json(rows)
         return
@@ -178,7 +178,7 @@ def _duration(seconds: float) -> str:
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
 
 
-def _ask(request: Request, host: str | None, group: str | None) -> Answer:
+def _ask(request: Request, host: str | None, group: str | None) -> HostAnswer:
     from skyloop.host.serve import ask, chosen_host
 
     return ask(chosen_host(host, group), request, group=group)

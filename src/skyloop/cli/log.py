@@ -37,7 +37,7 @@ DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="
 _EXAMPLE: Final = "Example: skyloop log "
 
 
-class Form(StrEnum):
+class ExportFormat(StrEnum):
     """The formats to which recordings can be exported."""
 
     CSV = "csv"
@@ -127,7 +127,7 @@ def export(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Recording; several for lerobot", autocompletion=recordings)
     ],
-    to: Annotated[Form, typer.Option("--to", help="csv and parquet: one file per channel")] = Form.CSV,
+    to: Annotated[ExportFormat, typer.Option("--to", help="csv and parquet: one file per channel")] = ExportFormat.CSV,
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="PATH", help="Folder for csv, parquet and lerobot, otherwise a file"),
@@ -156,12 +156,12 @@ def export(
     from skyloop.recording.review import tables as ways
     from skyloop.recording.review.video import export_mp4
 
-    if to is Form.LEROBOT:
+    if to is ExportFormat.LEROBOT:
         _refuse({"--channel": bool(channel), "--burn-time": burn_time, "--encode": encode}, to)
         _export_lerobot(files, output, drone, camera, fps, task)
         return
     _refuse({"--fps": fps is not None, "--task": task is not None}, to)
-    if to is Form.RRD:
+    if to is ExportFormat.RRD:
         _refuse(
             {"--channel": bool(channel), "--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to
         )
@@ -169,11 +169,11 @@ def export(
         raise UsageError(f"{len(files)} recordings given: {to.value} takes one at a time")
     (file,) = files
     recording = _open(file)
-    if to is Form.RRD:
+    if to is ExportFormat.RRD:
         _export_rrd(recording, _file(output, f"{file.stem}.rrd", file), drone)
         return
     name = recording.drone(drone).name
-    if to is Form.MP4:
+    if to is ExportFormat.MP4:
         _refuse({"--channel": bool(channel)}, to)
         if camera and len(camera) > 1:
             raise UsageError(f"{len(camera)} cameras given: mp4 takes one at a time")
@@ -187,10 +187,10 @@ def export(
     _refuse({"--camera": bool(camera), "--burn-time": burn_time, "--encode": encode}, to)
     with progress_bar("reading") as progress:
         tables = ways.read(recording, name, _channels(channel), progress)
-    if to is Form.NPZ:
+    if to is ExportFormat.NPZ:
         written = ways.export_npz(tables, output or file.with_suffix(".npz"))
     else:
-        write = ways.export_csv if to is Form.CSV else ways.export_parquet
+        write = ways.export_csv if to is ExportFormat.CSV else ways.export_parquet
         written = write(tables, output or file.with_name(f"{file.stem}-{to.value}"))
     rows = ", ".join(f"{len(table)} × {title}" for title, table in tables.items())
     tell(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
@@ -339,7 +339,7 @@ def _channels(names: list[str] | None) -> list[Channel] | None:
     return [Channel(name) for name in names] if names else None
 
 
-def _refuse(given: dict[str, bool], to: Form) -> None:
+def _refuse(given: dict[str, bool], to: ExportFormat) -> None:
     for option, is_given in given.items():
         if is_given:
             raise UsageError(f"{option} has no effect on {to.value}: leave it out, or choose another --to")

@@ -169,7 +169,7 @@ def router(
     """
     from skyloop.network import config
     from skyloop.network.config import Part
-    from skyloop.network.session import Session, acquire, release, renewed
+    from skyloop.network.session import FabricSession, acquire, release, renewed
 
     everywhere = f"{config.all_interfaces()}:{config.DEFAULT_PORT}"
     chosen = places(network, listen or [everywhere], connect, multicast, keys)
@@ -184,7 +184,7 @@ def router(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    session: Session = acquire(chosen, Part.ROUTER)
+    session: FabricSession = acquire(chosen, Part.ROUTER)
     with ExitStack() as beside:
         if metrics is not None:
             from skyloop.metrics import router_readings, serve

@@ -121,12 +121,12 @@ def _lead(
     workers: int, settings: Settings, target: str, drone: str, seconds: float | None, show: Callable[[Status], str]
 ) -> None:
     """Run several workers, each in its own process, so that none has to wait for another worker's GIL."""
-    from skyloop.processing.group import Group, child_command
+    from skyloop.processing.group import ProcessGroup, child_command
 
     if "://" in drone:
         raise UsageError(f"several workers need one proxy: skyloop proxy {drone} --name alpha, then --drone alpha")
     due = time.monotonic() + LINE_EVERY_S
-    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, tell) as group:
+    with ProcessGroup(child_command(_arguments(settings, target, drone, seconds)), workers, tell) as group:
         while (ended := group.code) is None:
             time.sleep(_POLL_S)
             status = group.status

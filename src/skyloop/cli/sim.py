@@ -70,7 +70,7 @@ def sim(
     keys: net.KeysOption = None,
     metrics: net.MetricsOption = None,
     firmware: Annotated[
-        Firmware | None,
+        FirmwareKind | None,
         typer.Option(
             metavar="KIND",
             help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
@@ -129,7 +129,7 @@ def sim(
     if firmware is None:
         given = [word for word, value in settings.items() if value is not None]
         if given:
-            raise UsageError(f"{given[0]} is for --firmware: give --firmware {Firmware.ARDRONE2} as well")
+            raise UsageError(f"{given[0]} is for --firmware: give --firmware {FirmwareKind.ARDRONE2} as well")
         network_settings = net.settings_of(network, listen, connect, multicast, keys)
         net.settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
@@ -209,7 +209,7 @@ def address(world: str, seed: int, speed: float, others: list[str]) -> str:
     return "sim://?" + urlencode(settings, safe="/,")
 
 
-class Firmware(StrEnum):
+class FirmwareKind(StrEnum):
     """The kinds of firmware that can be emulated."""
 
     ARDRONE1 = "ardrone1"
@@ -220,7 +220,7 @@ class Firmware(StrEnum):
     TELLO = "tello"
 
 
-MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
+MAVLINK: Final = (FirmwareKind.ARDUCOPTER, FirmwareKind.PX4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +234,7 @@ class Serving:
     video_port: int | None = None  #: for autopilots: port to which video is sent; None for no video
 
 
-def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
+def serve(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> None:
     """Run the drones until the process receives SIGINT or SIGTERM. Must run on the main thread.
 
     Once all drones are listening, print one line for each that begins with ``ready``. Raise ``UsageError`` if an option
@@ -244,15 +244,15 @@ def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving
         _run(_autopilots(options, drones, firmware, serving))
     elif serving.video_port is not None:
         raise UsageError("--video-port is for --firmware arducopter and px4: the others have their own port")
-    elif firmware is Firmware.BETAFLIGHT:
+    elif firmware is FirmwareKind.BETAFLIGHT:
         _run(_racers(options, drones, serving))
-    elif firmware is Firmware.TELLO:
+    elif firmware is FirmwareKind.TELLO:
         _run(_tellos(options, drones, serving))
     else:
         _run(_ardrones(options, drones, firmware, serving))
 
 
-def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[ArdroneFirmware]:
+def _ardrones(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[ArdroneFirmware]:
     from skyloop.sim.host import SimHost
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, with_ardrones
 
@@ -263,7 +263,7 @@ def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Ser
         ArdroneFirmware(
             host,
             drone,
-            version=1 if firmware is Firmware.ARDRONE1 else 2,
+            version=1 if firmware is FirmwareKind.ARDRONE1 else 2,
             bind=serving.bind,
             ports=ports,
             faults=serving.faults,
@@ -273,7 +273,7 @@ def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Ser
     ]
 
 
-def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[MavlinkFirmware]:
+def _autopilots(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[MavlinkFirmware]:
     from skyloop.sim.host import SimHost
     from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
 

@@ -39,7 +39,7 @@ from skyloop.client.authority import (
 from skyloop.client.channels import JOIN_S, Channel, Listener, Mailbox, checked_age
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelStats, Distribution
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.piloting import OnExit, Piloting
@@ -810,7 +810,7 @@ class Drone:
             ClosedError: If the drone was already closed.
         """
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.sample_notifier())
+        mailbox: Mailbox[ReceivedFrame] = Mailbox(notifier=self._state.sample_notifier())
         self._connection.check_may_wait()
         max_age_s, deadline = how.get("max_age_s"), time.monotonic() + timeout_s
         with self._state.closing(mailbox), channel.into(mailbox):
@@ -930,7 +930,7 @@ class Drone:
         depth: int = 1,
         inline: bool = False,
         **how: Unpack[VideoOptions],
-    ) -> Listener[Arrival]:
+    ) -> Listener[ReceivedFrame]:
         """Call ``function`` with the newest frame of a camera.
 
         Args:
@@ -950,7 +950,7 @@ class Drone:
         channel = self._state.follow(lambda: self._state.video.channel(camera, **how))
         max_age_s = how.get("max_age_s")
 
-        def call(arrival: Arrival) -> None:
+        def call(arrival: ReceivedFrame) -> None:
             frame = channel.current.picture(arrival, max_age_s)
             if frame is not None:
                 function(frame)

@@ -50,7 +50,7 @@ class Frame(_Base):
     ``received_ns`` on this host's.
     """
 
-    _arrival: Arrival
+    _arrival: ReceivedFrame
 
     @property
     def header(self) -> FrameHeader:
@@ -144,7 +144,7 @@ def png(image: NDArray[Any]) -> bytes | None:
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
-class Arrival:
+class ReceivedFrame:
     """A received frame. The first consumer that needs the image decodes it for all consumers, in its own thread."""
 
     __slots__ = (
@@ -231,8 +231,8 @@ class Arrival:
         return feedback, reach_s
 
 
-def compressed(frame: Frame, quality: int = 95) -> Arrival:
-    """Return a frame compressed as a JPEG, for storing many frames; :meth:`Arrival.frame` decodes it.
+def compressed(frame: Frame, quality: int = 95) -> ReceivedFrame:
+    """Return a frame compressed as a JPEG, for storing many frames; :meth:`ReceivedFrame.frame` decodes it.
 
     Raises :class:`MissingExtraError` if OpenCV is not installed, or :class:`LinkError` if encoding fails.
     """
@@ -241,7 +241,7 @@ def compressed(frame: Frame, quality: int = 95) -> Arrival:
     request = VideoRequest(frame.camera, encoding="jpeg", quality=quality)
     header, jpeg = encode_frame(plain, np.asarray(frame).reshape(-1), request)
     pixels = np.frombuffer(jpeg, np.uint8)
-    return Arrival(header, pixels, from_.received_ns, from_._offset_ns, from_._history, from_._clock)
+    return ReceivedFrame(header, pixels, from_.received_ns, from_._offset_ns, from_._history, from_._clock)
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ from typing import Any, Final, Self, TypeVar
 from skyloop.client.channels import C, Channel, FollowingChannel, Listener, Mailbox, Notifier, checked_age
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import ResultChannels, ResultMailbox
@@ -82,7 +82,7 @@ class Mailboxes:
         self.clock = state.scheduler.clock  #: the clock that a controller uses
         self.notifier = state.sample_notifier()
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
-        self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
+        self.frames: Mailbox[ReceivedFrame] = Mailbox(1, self.notifier)
         self.results = ResultMailbox(checked_age(max_age_s), self.notifier)
         self._video = state.follow(lambda: state.video.channel(camera)) if frames else None
         self._feedback_channel = state.on_feedback if feedback else None

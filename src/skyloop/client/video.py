@@ -13,7 +13,7 @@ import numpy as np
 
 from skyloop.client.channels import Channel, checked_age
 from skyloop.client.connection import ProxyConnection, Scheduler
-from skyloop.client.frame import Arrival, FeedbackHistory, Frame
+from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelCounter, ChannelStats, StallWatch
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UnknownNameError, UnsupportedError, UsageError
@@ -60,7 +60,7 @@ class StreamOptions(TypedDict, total=False):
     subscriber: str  #: the only subscriber; the proxy adapts the rate to its path
 
 
-class VideoChannel(Channel[Arrival]):
+class VideoChannel(Channel[ReceivedFrame]):
     """Frames of one camera for one request."""
 
     def __init__(
@@ -77,7 +77,7 @@ class VideoChannel(Channel[Arrival]):
         super().__init__(lambda on: connection.subscribe(self.request.topic, on))
         #: Name in the statistics: the camera's plain topic for the default request, otherwise the request's topic.
         self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
-        self.newest: Arrival | None = None
+        self.newest: ReceivedFrame | None = None
         self.notifier = scheduler.notifier()  #: notified of each frame
         self.counter = ChannelCounter()
         self.undecodable = 0
@@ -87,7 +87,7 @@ class VideoChannel(Channel[Arrival]):
         chosen = self.request.part is not None or self.request.max_fps is not None
         #: Selects the frames for this request from the full stream; None if the request includes all frames.
         self.filter = FrameFilter(self.request) if chosen else None
-        self._read: Arrival | None = None  # the last result of next_frame()
+        self._read: ReceivedFrame | None = None  # the last result of next_frame()
         self._connection = connection
         self._history = history
         self._clock = scheduler.clock
@@ -102,7 +102,7 @@ class VideoChannel(Channel[Arrival]):
         self._read = arrival = self.newest
         return None if arrival is None else self.picture(arrival)
 
-    def picture(self, arrival: Arrival, max_age_s: float | None = None) -> Frame | None:
+    def picture(self, arrival: ReceivedFrame, max_age_s: float | None = None) -> Frame | None:
         """Decode the frame; if it is damaged or older than ``max_age_s`` [s], count it and return None."""
         if max_age_s is not None and arrival.age_s > max_age_s:
             self.too_old += 1
@@ -123,7 +123,7 @@ class VideoChannel(Channel[Arrival]):
         if last is not None and header.seq <= last:
             return  # a duplicate, or older than the newest frame
         offset_ns, scale = self._connection.offset_ns, 1.0 if as_asked else self.request.scale
-        arrival = Arrival(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
+        arrival = ReceivedFrame(header, pixels, now_ns, offset_ns, self._history, self._clock, scale)
         # Serve the consumers before updating the statistics. The previous frame is released last, because returning its
         # memory to the proxy takes longer than all other steps.
         before, self.newest = self.newest, arrival

@@ -257,7 +257,7 @@ class TokenGate:
             del self._sessions[next(iter(self._sessions))]
         value = secrets.token_urlsafe(32)
         origin = _hash(token) if self.known(token) is not None else b""
-        session = Session(_hash(value), origin, person.role, person.name, now_ns + nanoseconds(SESSION_S))
+        session = LoginSession(_hash(value), origin, person.role, person.name, now_ns + nanoseconds(SESSION_S))
         self._sessions[session.cookie] = session
         self._keep()
         return value
@@ -271,7 +271,7 @@ class TokenGate:
         if self._kept is not None:
             self._kept.save(self._sessions.values())
 
-    def _still_lets_in(self, session: Session) -> bool:
+    def _still_lets_in(self, session: LoginSession) -> bool:
         """Return whether a session would be admitted now: its token is still known, or pairing still gives its role."""
         if session.origin == b"":
             return self.pairing is not None and self.pairing.role is session.role
@@ -406,7 +406,7 @@ class WrongTokens:
 MAX_BYTES: Final = 1_000_000  #: the file's maximum size; a longer one counts as damaged
 
 
-class Session(msgspec.Struct, frozen=True):
+class LoginSession(msgspec.Struct, frozen=True):
     """One log-in."""
 
     cookie: bytes  #: the cookie's hash
@@ -418,7 +418,7 @@ class Session(msgspec.Struct, frozen=True):
 
 class _Content(msgspec.Struct):
     boot: str
-    sessions: list[Session]
+    sessions: list[LoginSession]
 
 
 class SessionFile:
@@ -432,7 +432,7 @@ class SessionFile:
         self._path = path
         self._boot = boot_id() if boot is None else boot
 
-    def load(self) -> list[Session]:
+    def load(self) -> list[LoginSession]:
         """Return the sessions; none if the file is missing, damaged, owned by others or from before a reboot."""
         try:
             descriptor = os.open(self._path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
@@ -444,7 +444,7 @@ class SessionFile:
             return []
         return content.sessions if content is not None and self._boot and content.boot == self._boot else []
 
-    def save(self, sessions: Iterable[Session]) -> None:
+    def save(self, sessions: Iterable[LoginSession]) -> None:
         """Replace the file. If this fails, the only consequence is that people have to log in again after a restart."""
         new = self._path.with_name(f"{self._path.name}.new")
         try:

@@ -38,7 +38,7 @@ class Alarm(msgspec.Struct, frozen=True):
     text: str  #: a description that includes the current value
 
 
-class Thresholds(msgspec.Struct, frozen=True):
+class AlarmThresholds(msgspec.Struct, frozen=True):
     """The values at which alarms start: charges from 0 to 1, ages in seconds; 0 means never."""
 
     battery_low: float = 0.2
@@ -48,7 +48,7 @@ class Thresholds(msgspec.Struct, frozen=True):
     link_degraded_s: float = 0.5
 
 
-USUAL: Final = Thresholds()
+USUAL: Final = AlarmThresholds()
 
 
 class DegradedTimes:
@@ -70,7 +70,7 @@ def alarms(
     feedback_age_s: float | None,
     video_age_s: Mapping[str, float],
     degraded_s: Mapping[str, float],
-    thresholds: Thresholds = USUAL,
+    thresholds: AlarmThresholds = USUAL,
 ) -> list[Alarm]:
     """Return the current alarms, the most severe first.
 
@@ -93,7 +93,7 @@ def alarms(
     return sorted(found, key=lambda alarm: alarm.severity is not AlarmSeverity.CRITICAL)
 
 
-def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make) -> Iterator[Alarm]:
+def _of_flight(feedback: Feedback | None, thresholds: AlarmThresholds, urgent: _Make) -> Iterator[Alarm]:
     if feedback is None:
         return
     if feedback.state is FlightState.EMERGENCY:
@@ -112,7 +112,7 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
 
 
 def _of_links(
-    link: LinkStatus, degraded_s: Mapping[str, float], thresholds: Thresholds, urgent: _Make
+    link: LinkStatus, degraded_s: Mapping[str, float], thresholds: AlarmThresholds, urgent: _Make
 ) -> Iterator[Alarm]:
     if link.vehicle is LinkState.LOST:
         yield urgent("vehicle_link", _because("link to the vehicle lost", link.reason, link.remedy))
@@ -140,7 +140,7 @@ def _because(what: str, *more: str) -> str:
 
 
 RETRY_S: Final = 2.0  #: pause between attempts to read the parameters
-#: The proxy's parameters, keyed by field of :class:`Thresholds`.
+#: The proxy's parameters, keyed by field of :class:`AlarmThresholds`.
 PARAMETERS: Final = {
     "battery_low": "battery.warn",
     "battery_critical": "alarms.battery_critical",
@@ -169,7 +169,7 @@ class ThresholdReader:
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._is_stale, self._tried_ns = True, None
 
-    def newest(self) -> Thresholds:
+    def newest(self) -> AlarmThresholds:
         """Return the thresholds read last; start reading them again if they may have changed. Does not block."""
         now_ns = self._clock()
         rested = self._tried_ns is None or now_ns - self._tried_ns >= nanoseconds(RETRY_S)
@@ -190,7 +190,7 @@ class ThresholdReader:
             self._task = None
 
 
-def thresholds_of(config: Config | Mapping[str, Value]) -> Thresholds:
+def thresholds_of(config: Config | Mapping[str, Value]) -> AlarmThresholds:
     """Read the thresholds; use the default for each threshold that the proxy lacks or that is not finite."""
     return msgspec.structs.replace(USUAL, **{field: _number(config, name, field) for field, name in PARAMETERS.items()})
 

@@ -29,7 +29,7 @@ from skyloop.errors import (
 from skyloop.messages import Parameter, Value
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.fleet import CockpitFleet
     from skyloop.cockpit.listening import Admission
     from skyloop.cockpit.routes import RouteFiles
     from skyloop.cockpit.stream import PageCounts
@@ -138,7 +138,7 @@ class Api:
 
     def __init__(
         self,
-        fleet: Fleet,
+        fleet: CockpitFleet,
         gate: Gate,
         counts: PageCounts,
         scheme: str,
@@ -286,7 +286,7 @@ def _value(value: Value) -> Any:
 class RoutesApi:
     """The routes below ``/api/routes``, including the check of a flight route for one drone."""
 
-    def __init__(self, fleet: Fleet, files: RouteFiles) -> None:
+    def __init__(self, fleet: CockpitFleet, files: RouteFiles) -> None:
         self._fleet = fleet
         self._files = files
         self._checking = asyncio.Semaphore(MOST_CHECKS)

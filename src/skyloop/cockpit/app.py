@@ -41,7 +41,7 @@ from starlette.websockets import WebSocket
 from skyloop.cockpit.access import Gate
 from skyloop.cockpit.api import Api, RoutesApi
 from skyloop.cockpit.control_session import ControlSession
-from skyloop.cockpit.fleet import Fleet, FleetSession, Overview
+from skyloop.cockpit.fleet import CockpitFleet, FleetOverview, FleetSession
 from skyloop.cockpit.follow_session import FollowerFactory
 from skyloop.cockpit.listening import Admission
 from skyloop.cockpit.recordings import Recordings
@@ -147,12 +147,12 @@ _THREADS: Final = 32  # number of threads for blocking work, such as waiting for
 class Cockpit:
     """Serves the page and the WebSockets. ``follower``: creates a follower for each target marked on a page."""
 
-    def __init__(self, fleet: Fleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
+    def __init__(self, fleet: CockpitFleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
         self.counts = PageCounts()
         self.files = PageFiles(static)
         self._fleet = fleet
         self._recordings = recordings
-        self._overview = Overview(fleet, recordings)
+        self._overview = FleetOverview(fleet, recordings)
         self._follower = follower
 
     @asynccontextmanager
@@ -229,7 +229,7 @@ class Cockpit:
 
 
 def create_app(
-    fleet: Fleet,
+    fleet: CockpitFleet,
     recordings: Recordings,
     names: Names,
     gate: Gate,

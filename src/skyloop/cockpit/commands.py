@@ -25,7 +25,7 @@ AHEAD_S: Final = 0.05  #: clock difference tolerated beyond the page's own bound
 SETTLED_NS: Final = 50_000_000  #: feedback captured this soon after a command may predate the command [ns]
 
 
-class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):
+class PageCommand(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):
     """The base of all commands from a page."""
 
     #: Time at which the person requested it, on the cockpit's clock as the page estimates it from pongs [s].
@@ -39,18 +39,18 @@ class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields
         return str(self.__struct_config__.tag)
 
 
-class Take(Command, frozen=True, tag="take"):
+class Take(PageCommand, frozen=True, tag="take"):
     """Request control authority with a priority from 0 (highest) to 31."""
 
     priority: Priority
     ask: bool = False  #: whether to ask the holder first and wait in the queue
 
 
-class Release(Command, frozen=True, tag="release"):
+class Release(PageCommand, frozen=True, tag="release"):
     """Release authority, or leave the queue."""
 
 
-class Answer(Command, frozen=True, tag="answer"):
+class Answer(PageCommand, frozen=True, tag="answer"):
     """The holder's response to a request for its authority."""
 
     id: int  #: id of the question
@@ -58,27 +58,27 @@ class Answer(Command, frozen=True, tag="answer"):
     reason: Reason = ""  #: reason for a refusal, shown to the person who made the request
 
 
-class TakeOff(Command, frozen=True, tag="takeoff"): ...
+class TakeOff(PageCommand, frozen=True, tag="takeoff"): ...
 
 
-class HoverHere(Command, frozen=True, tag="hover"):
+class HoverHere(PageCommand, frozen=True, tag="hover"):
     """Hover because a person requested it or, if ``automatic``, because no key or stick is held anymore."""
 
     automatic: bool = False
 
 
-class LandHere(Command, frozen=True, tag="land"): ...
+class LandHere(PageCommand, frozen=True, tag="land"): ...
 
 
-class Stop(Command, frozen=True, tag="stop"):
+class Stop(PageCommand, frozen=True, tag="stop"):
     """Cut the motors. This command needs no authority."""
 
 
-class Reset(Command, frozen=True, tag="reset"):
+class Reset(PageCommand, frozen=True, tag="reset"):
     """Leave the vehicle's emergency state."""
 
 
-class Fly(Command, frozen=True, tag="fly"):
+class Fly(PageCommand, frozen=True, tag="fly"):
     """Move the sticks: velocity in the levelled body axes [m/s], yaw rate counter-clockwise [rad/s]."""
 
     forward: float = 0.0
@@ -89,7 +89,7 @@ class Fly(Command, frozen=True, tag="fly"):
     touches: int | None = None
 
 
-class GoTo(Command, frozen=True, tag="goto"):
+class GoTo(PageCommand, frozen=True, tag="goto"):
     """Fly to a place in world axes: east, north and up [m], yaw counter-clockwise from east [rad]."""
 
     x: float
@@ -98,39 +98,39 @@ class GoTo(Command, frozen=True, tag="goto"):
     yaw: float | None = None
 
 
-class FlyBack(Command, frozen=True, tag="return"):
+class FlyBack(PageCommand, frozen=True, tag="return"):
     """Fly back to the take-off position and then land or hover there, depending on the drone's parameters."""
 
 
-class FlyRoute(Command, frozen=True, tag="route"):
+class StartRoute(PageCommand, frozen=True, tag="route"):
     """Fly a checked route; ``id`` comes from the response to the check."""
 
     id: Annotated[str, msgspec.Meta(max_length=64)]
 
 
-class PauseRoute(Command, frozen=True, tag="route_pause"):
+class PauseRoute(PageCommand, frozen=True, tag="route_pause"):
     """Hover until the route is resumed."""
 
 
-class ResumeRoute(Command, frozen=True, tag="route_resume"):
+class ResumeRoute(PageCommand, frozen=True, tag="route_resume"):
     """Continue to the next waypoint of a paused route."""
 
 
-class SkipWaypoint(Command, frozen=True, tag="route_skip"):
+class SkipWaypoint(PageCommand, frozen=True, tag="route_skip"):
     """Skip the current waypoint."""
 
 
-class StopRoute(Command, frozen=True, tag="route_stop"):
+class StopRoute(PageCommand, frozen=True, tag="route_stop"):
     """End the route and hover."""
 
 
-class SelectTarget(Command, frozen=True, tag="follow_select"):
+class SelectTarget(PageCommand, frozen=True, tag="follow_select"):
     """Keep a camera's frames while a person draws a box on one of them; if the camera is None, stop keeping them."""
 
     camera: CameraName | None
 
 
-class FollowTarget(Command, frozen=True, tag="follow"):
+class TrackTarget(PageCommand, frozen=True, tag="follow"):
     """Track the object inside a box and, if a mode is given, follow it."""
 
     camera: CameraName
@@ -142,33 +142,33 @@ class FollowTarget(Command, frozen=True, tag="follow"):
     size: tuple[Pixels, Pixels] | None = None  #: size of the image under the box; None for the frame's size
 
 
-class SetFollowMode(Command, frozen=True, tag="follow_mode"):
+class SetFollowMode(PageCommand, frozen=True, tag="follow_mode"):
     """Follow the tracked target, or change the mode of following."""
 
     mode: Word
     distance_m: float | None = None  #: distance to keep from the target; None to leave it unchanged
 
 
-class StopFollowing(Command, frozen=True, tag="follow_stop"):
+class StopFollowing(PageCommand, frozen=True, tag="follow_stop"):
     """Forget the target; hover if the vehicle was following it."""
 
 
-class Write(Command, frozen=True, tag="set"):
+class Write(PageCommand, frozen=True, tag="set"):
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
     value: bool | int | float | str | list[float]
 
 
-class Alive(Command, frozen=True, tag="ping"):
+class Alive(PageCommand, frozen=True, tag="ping"):
     """Report that the page is present and receives data: ``seen_s`` is the ``now_s`` of its newest pong."""
 
     seen_s: float | None = None
 
 
-class LandAll(Command, frozen=True, tag="land_all"):
+class LandAll(PageCommand, frozen=True, tag="land_all"):
     """Land every drone."""
 
 
-class StopAll(Command, frozen=True, tag="stop_all"):
+class StopAll(PageCommand, frozen=True, tag="stop_all"):
     """Cut the motors of every drone. This needs no authority."""
 
 
@@ -186,13 +186,13 @@ AnyCommand = (
     | FlyBack
     | Write
     | Alive
-    | FlyRoute
+    | StartRoute
     | PauseRoute
     | ResumeRoute
     | SkipWaypoint
     | StopRoute
     | SelectTarget
-    | FollowTarget
+    | TrackTarget
     | SetFollowMode
     | StopFollowing
 )
@@ -215,7 +215,7 @@ def decode_fleet_command(text: str | bytes) -> AnyFleetCommand:
     return command
 
 
-def late_s(command: Command) -> float:
+def late_s(command: PageCommand) -> float:
     """Return the age from which a command counts as late [s]."""
     return STOP_LATE_S if isinstance(command, Stop | StopAll) else LATE_S
 
@@ -242,7 +242,7 @@ class HandWatch:
         return now_s - self._moved_s <= UNTOUCHED_S
 
 
-def untimely(command: Command, now_s: float) -> str:
+def untimely(command: PageCommand, now_s: float) -> str:
     """Return the reason for refusing a command because of its age; empty if the command is recent enough.
 
     A command whose age is unknown is refused, and a command that might be too old is treated as too old.

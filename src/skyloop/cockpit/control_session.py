@@ -108,7 +108,7 @@ class ControlSession:
             Fly: self._fly,
             commands.GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
             commands.FlyBack: lambda command: self._set_out(command, to_start),
-            commands.FlyRoute: lambda command: self._run_in_turn(
+            commands.StartRoute: lambda command: self._run_in_turn(
                 command, partial(self._fly_route, held=self._still_held(command))
             ),
             commands.PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
@@ -116,7 +116,7 @@ class ControlSession:
             commands.SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
             commands.StopRoute: lambda command: self._steer_route(command, RouteSession.end),
             commands.SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
-            commands.FollowTarget: lambda command: self._run_in_turn(
+            commands.TrackTarget: lambda command: self._run_in_turn(
                 command, partial(self._follow_target, held=self._still_held(command))
             ),
             commands.SetFollowMode: self._set_follow_mode,
@@ -248,7 +248,7 @@ class ControlSession:
         self._acknowledge(command)
         self._restart_silence_timer()
 
-    async def _fly_route(self, command: commands.FlyRoute, held: Callable[[], PilotConnection]) -> None:
+    async def _fly_route(self, command: commands.StartRoute, held: Callable[[], PilotConnection]) -> None:
         """Check a route again, because the situation may have changed, and fly it."""
         route = self._station.routes.get(command.id)
         held()
@@ -279,7 +279,7 @@ class ControlSession:
         await self._follow.select(command)
         self._acknowledge(command)
 
-    async def _follow_target(self, command: commands.FollowTarget, held: Callable[[], PilotConnection]) -> None:
+    async def _follow_target(self, command: commands.TrackTarget, held: Callable[[], PilotConnection]) -> None:
         """Track the object inside a box. Authority is needed only if a mode is given."""
         await self._follow.begin(command, held)
         self._acknowledge(command)
@@ -580,6 +580,6 @@ def _is_deaf(command: AnyCommand, now_ns: int) -> bool:
 
 def _decides(command: AnyCommand) -> bool:
     """Return whether a command starts, controls or ends a flight."""
-    if isinstance(command, commands.FollowTarget):
+    if isinstance(command, commands.TrackTarget):
         return command.mode is not None
     return not isinstance(command, commands.Take | commands.Answer | commands.Write | commands.SelectTarget | Alive)

@@ -11,10 +11,10 @@ from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
     from skyloop.network import FabricSettings
-    from skyloop.network.session import Session
+    from skyloop.network.session import FabricSession
 
 
-class Found(NamedTuple):
+class FoundProxy(NamedTuple):
     """A proxy that can be connected to."""
 
     name: str
@@ -25,7 +25,7 @@ class Found(NamedTuple):
 class Finder(Protocol):
     """Searches for proxies repeatedly, on threads other than that of the event loop."""
 
-    def __call__(self) -> list[Found]:
+    def __call__(self) -> list[FoundProxy]:
         """Return the proxies that can be connected to now."""
 
     def add_name(self, name: str) -> None:
@@ -42,7 +42,7 @@ class LocalFinder:
         """Prepare the search. ``names``: the names to search for; if empty, all names are searched for."""
         self._names = frozenset(names)
         self._also: set[str] = set()
-        self._known: dict[tuple[str, Path], Found] = {}
+        self._known: dict[tuple[str, Path], FoundProxy] = {}
 
     def add_name(self, name: str) -> None:
         self._also.add(name)
@@ -50,14 +50,14 @@ class LocalFinder:
     def close(self) -> None:
         """Do nothing: each search closes what it opens."""
 
-    def __call__(self) -> list[Found]:
+    def __call__(self) -> list[FoundProxy]:
         from skyloop.transport.local import dial
         from skyloop.transport.local.directory import find_directory
 
         found = []
         for name, path in find_directory().running().items():
             if self._wanted(name):
-                found.append(self._known.setdefault((name, path), Found(name, "local", dial(name))))
+                found.append(self._known.setdefault((name, path), FoundProxy(name, "local", dial(name))))
         return found
 
     def _wanted(self, name: str) -> bool:
@@ -80,15 +80,15 @@ class NetworkFinder:
         self._settings = settings
         self._wanted = wanted
         self._lock = threading.Lock()  # guards the settings and the following fields: several threads may search
-        self._session: Session | None = None
-        self._known: dict[str, Found] = {}
+        self._session: FabricSession | None = None
+        self._known: dict[str, FoundProxy] = {}
 
     def add_name(self, name: str) -> None:
         self._local.add_name(name)
         if self._wanted:
             self._wanted |= {name}
 
-    def __call__(self) -> list[Found]:
+    def __call__(self) -> list[FoundProxy]:
         from skyloop.network.discovery import runs
 
         found = {one.name: one for one in self._local()}
@@ -105,7 +105,7 @@ class NetworkFinder:
         if session is not None:
             release(session)
 
-    def _open(self) -> Session:
+    def _open(self) -> FabricSession:
         from skyloop.network.config import Part
         from skyloop.network.session import acquire, release
 
@@ -119,10 +119,10 @@ class NetworkFinder:
                 self._session = acquire(current, Part.APP)
             return self._session
 
-    def _found(self, name: str) -> Found:
+    def _found(self, name: str) -> FoundProxy:
         from skyloop.network import dial
 
         with self._lock:
             if name not in self._known:
-                self._known[name] = Found(name, "network", dial(name, self._settings))
+                self._known[name] = FoundProxy(name, "network", dial(name, self._settings))
             return self._known[name]

@@ -232,7 +232,7 @@ def rounded_width(wish: int) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Form:
+class FeedFormat:
     """The encoding of a camera's stream; by default, the encoding chosen by the vehicle.
 
     ``kbit_s``: the bit rate of a stream that all subscribers with the same values share. ``subscriber``: the name of
@@ -252,7 +252,7 @@ class Form:
         return "vehicle" if self.kbit_s is None else "shared"
 
 
-def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Form:
+def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> FeedFormat:
     """Return the encoding that all panes of about the same size share.
 
     ``width``: width of the pane [device pixels], or 0 for full size. ``max_fps``: maximum number of pictures per
@@ -262,11 +262,11 @@ def form_for(camera: CameraInfo, width: int, max_fps: float | None = None) -> Fo
     if 0 < width < camera.width:
         scale = next(step for step in SCALES if step * camera.width >= width)
     if camera.stream == "h264" and scale == 1.0 and max_fps is None:
-        return Form()
+        return FeedFormat()
     fps = camera.fps if camera.fps > 0.0 else _FPS
     fps = fps if max_fps is None else min(fps, max_fps)
     good_kbit_s = camera.width * camera.height * scale**2 * fps * BITS / 1000
-    return Form(next((rate for rate in RATES if rate >= good_kbit_s), RATES[-1]), scale, max_fps)
+    return FeedFormat(next((rate for rate in RATES if rate >= good_kbit_s), RATES[-1]), scale, max_fps)
 
 
 class EncodedFeed:
@@ -274,7 +274,7 @@ class EncodedFeed:
 
     encoded = 0  #: number of frames encoded here; always 0, because H.264 is only relayed
 
-    def __init__(self, drone: Drone, camera: str, form: Form, clock: Clock = monotonic_ns) -> None:
+    def __init__(self, drone: Drone, camera: str, form: FeedFormat, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
         self.form = form
         self._counter = ChannelCounter()

@@ -19,7 +19,7 @@ from starlette.websockets import WebSocket
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import Alarm, AlarmSeverity
 from skyloop.cockpit.commands import SETTLED_NS, Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
-from skyloop.cockpit.discovery import Finder, Found
+from skyloop.cockpit.discovery import Finder, FoundProxy
 from skyloop.cockpit.feeds import PeriodicBroadcast, start_task
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import PageSocket
@@ -37,7 +37,7 @@ CONNECT_S: Final = 3.0  #: time limit for connecting to a proxy
 OVERVIEW_S: Final = 0.5  #: interval between overviews sent to pages
 FIRST_SEARCH_S: Final = 2.0  #: maximum time that the first pages wait for slow drones
 
-Connect = Callable[[Found], "Drone"]
+Connect = Callable[[FoundProxy], "Drone"]
 _log = logging.getLogger(__name__)
 LANDING_S: Final = 60.0  #: time for which the landing command is repeated
 BEGIN_S: Final = 2.0  #: time limit for opening the connection needed to begin a landing
@@ -46,14 +46,14 @@ _POLL_S: Final = 0.05  # interval between checks whether a drone has landed
 Json = dict[str, Any]
 
 
-def observe(found: Found) -> Drone:
+def observe(found: FoundProxy) -> Drone:
     """Connect to a proxy as an observer; raise ``SkyloopError`` if that takes longer than :data:`CONNECT_S`."""
     from skyloop.client.drone import open_drone
 
     return open_drone(found.dial, app="cockpit", access="observe", timeout_s=CONNECT_S)
 
 
-class Fleet:
+class CockpitFleet:
     """The stations, by drone name.
 
     ``connect``: connects to a proxy; called on worker threads. ``kept``: names that stay listed once found.
@@ -76,7 +76,7 @@ class Fleet:
         self._clock = clock
         self._search_s = search_s
         self._seen_ns: dict[str, int] = {}
-        self._found: dict[str, Found] = {}  # the proxies found by the last search
+        self._found: dict[str, FoundProxy] = {}  # the proxies found by the last search
         self._over: set[str] = set()  # proxies that are ending, until they are no longer found
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
@@ -159,7 +159,7 @@ class Fleet:
             except (SkyloopError, OSError) as error:
                 _log.warning("can't search for drones: %s", error)
 
-    async def _join(self, found: Found) -> None:
+    async def _join(self, found: FoundProxy) -> None:
         # A drone may move to another host under the same name; new connections will then find it there.
         found = found._replace(dial=lambda handler: self._found[found.name].dial(handler))
         try:
@@ -173,10 +173,10 @@ class Fleet:
             del self._connecting[found.name]
 
 
-class Overview:
+class FleetOverview:
     """All drones in one message, created twice a second for all pages."""
 
-    def __init__(self, fleet: Fleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
+    def __init__(self, fleet: CockpitFleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
         self._fleet = fleet
         self._recordings = recordings
         self.broadcast = PeriodicBroadcast(period_s, self._make, lambda _: None)
@@ -220,7 +220,7 @@ def _silent(name: str, problem: str) -> dict[str, Any]:
 class FleetSession:
     """Serves one socket of a pilot's page; its commands complete even if the page goes away. Used on the event loop."""
 
-    def __init__(self, socket: WebSocket, fleet: Fleet, person: str = "", clock: Clock = monotonic_ns) -> None:
+    def __init__(self, socket: WebSocket, fleet: CockpitFleet, person: str = "", clock: Clock = monotonic_ns) -> None:
         self._page = PageSocket(socket)
         self._send = self._page.send
         self._fleet = fleet

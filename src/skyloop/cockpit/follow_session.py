@@ -26,7 +26,7 @@ from skyloop.vision.tracking import Box, checked_box
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.commands import FollowTarget, SelectTarget, SetFollowMode
+    from skyloop.cockpit.commands import SelectTarget, SetFollowMode, TrackTarget
     from skyloop.cockpit.station import PilotConnection
     from skyloop.messages import AnyAction
 
@@ -117,7 +117,7 @@ class FollowSession:
             self._drone, camera.name, lambda since_ns: call_soon(loop, self._selecting, camera.name, since_ns)
         )
 
-    async def begin(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
+    async def begin(self, command: TrackTarget, held: Callable[[], PilotConnection]) -> None:
         """Track the object inside a box; if a mode is given, follow it once the tracker has caught up.
 
         Args:
@@ -332,7 +332,7 @@ class FollowSession:
         raise UnknownNameError("camera", name, [camera.name for camera in cameras])
 
 
-def in_frame(command: FollowTarget, header: FrameHeader) -> Box:
+def in_frame(command: TrackTarget, header: FrameHeader) -> Box:
     """Convert the box in a command to pixels of the frame, even if the page received the picture in another size."""
     x, y, width, height = command.box
     if command.size is None:

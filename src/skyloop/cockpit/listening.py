@@ -214,7 +214,7 @@ class _Accepted(socket.socket):
             on_close()
 
 
-class Listener:
+class Acceptor:
     """Accepts connections while :meth:`run` is running, as long as the admission has room. Used on the event loop."""
 
     def __init__(

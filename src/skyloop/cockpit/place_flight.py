@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.client.actions import ReturnWatch, position_action
 from skyloop.cockpit.feeds import start_task
-from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto, save_photo
+from skyloop.control.route_law import Effect, Progress, RouteCommand, RouteLaw, TakePhoto, save_photo
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import LinkError, RefusedError, SkyloopError
 from skyloop.messages import Feedback, FlightState, Hover, Land, Position, ReturnPhase, ReturnToStart
@@ -212,7 +212,7 @@ class RouteSession:
 
     def _carry_out(self, effects: list[Effect], *, send: bool = True, automatic: bool = False) -> None:
         for effect in effects:
-            if isinstance(effect, Command):
+            if isinstance(effect, RouteCommand):
                 self._action = effect.action if isinstance(effect.action, Position) else None
                 if send:
                     self._command(effect.action, automatic=automatic)

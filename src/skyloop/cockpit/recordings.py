@@ -40,7 +40,7 @@ from skyloop.messages import Event, EventKind, Feedback, LogEntry, Refusal, Seve
 from skyloop.platform import lower_priority
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import ENDING, Described, describe, shown_name
-from skyloop.recording.plain import Course
+from skyloop.recording.plain import TimeCourse
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -476,7 +476,7 @@ _LEFT_OUT: Final = frozenset({EventKind.PARAMETER_CHANGED})
 
 def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     """Return a recording's events and course as JSON values, with positions like ``replay.position_s``."""
-    course = Course()
+    course = TimeCourse()
     events: list[dict[str, Any]] = []
     marks: list[dict[str, Any]] = []
     times: list[float] = []

@@ -18,7 +18,7 @@ from skyloop.cockpit.recordings import MARK, Recordings
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.fleet import CockpitFleet
     from skyloop.cockpit.recording_files import Notes
 
 #: A report is a complete page with an inline script; it runs without this page's permissions.
@@ -57,7 +57,7 @@ class _Playback(msgspec.Struct):
 class RecordingsApi:
     """The routes below ``/api/recordings`` and ``/api/replays``."""
 
-    def __init__(self, fleet: Fleet, recordings: Recordings) -> None:
+    def __init__(self, fleet: CockpitFleet, recordings: Recordings) -> None:
         self._fleet = fleet
         self._recordings = recordings
 

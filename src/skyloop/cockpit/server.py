@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.cockpit.addresses import bind, host_names, own_addresses, reachable
-from skyloop.cockpit.listening import Admission, Connection, Listener, ProtocolFactory, limit_messages, places_here
+from skyloop.cockpit.listening import Acceptor, Admission, Connection, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
 from skyloop.metrics import client_readings
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from skyloop.cockpit.access import Gate, SessionFile
     from skyloop.cockpit.discovery import Finder
-    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.fleet import CockpitFleet
     from skyloop.cockpit.station import Station
     from skyloop.messages.parameter import WorldGeometry
     from skyloop.metrics.endpoint import Source
@@ -157,7 +157,7 @@ def serve_cockpit(
         code = f"#pair={pairing.code()}" if on_ready is not None and pairing is not None and not access.pair else ""
 
         from skyloop.cockpit.app import create_app
-        from skyloop.cockpit.fleet import Fleet
+        from skyloop.cockpit.fleet import CockpitFleet
         from skyloop.cockpit.recordings import Recordings
         from skyloop.cockpit.target_tracker import warm_up
 
@@ -165,14 +165,14 @@ def serve_cockpit(
         own_name = () if bind_address(address)[1] else host_names()
         hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
         admission = Admission(places_here())
-        fleet = Fleet(finder, kept=names)
+        fleet = CockpitFleet(finder, kept=names)
         authority = None if access.page_authority is None else access.page_authority.read_bytes()
         kept = Recordings(recordings)
         app = create_app(fleet, kept, hosts, gate, admission=admission, world=given, page_authority=authority)
         server = quiet_server(app)
         seen_at = reachable(address)[0]
         page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
-        listener = Listener(listening, admission, http_protocol(server, admission), tls)
+        acceptor = Acceptor(listening, admission, http_protocol(server, admission), tls)
         if metrics is not None:
             from skyloop.metrics import serve
 
@@ -180,7 +180,7 @@ def serve_cockpit(
             print(endpoint.announcement, file=sys.stderr, flush=True)
         expire_codes = pairing.expire if pairing is not None else lambda: None
         threading.Thread(target=warm_up, name="skyloop-warm-up").start()
-        asyncio.run(_run(server, listener, lambda: ready(page + code), stop, expire_codes))
+        asyncio.run(_run(server, acceptor, lambda: ready(page + code), stop, expire_codes))
 
 
 def with_certificate(access: Access, directory: Path) -> Access:
@@ -348,7 +348,7 @@ def quiet_server(app: Starlette) -> uvicorn.Server:
 
 async def _run(
     server: uvicorn.Server,
-    listener: Listener,
+    acceptor: Acceptor,
     on_ready: Callable[[], None],
     stop: threading.Event | None,
     expire_codes: Callable[[], None],
@@ -359,7 +359,7 @@ async def _run(
     serving = asyncio.create_task(server.serve(sockets=[]))
     while not server.started and not serving.done():
         await asyncio.sleep(_POLL_S / 10)
-    listening = asyncio.create_task(listener.run())
+    listening = asyncio.create_task(acceptor.run())
     await asyncio.sleep(0)  # the first step of the event loop starts listening
     if not serving.done():
         on_ready()
@@ -372,16 +372,16 @@ async def _run(
     await asyncio.gather(listening, return_exceptions=True)
     await serving
     if not listening.cancelled():
-        await listening  # raises the error that ended the listener
+        await listening  # raises the error that ended the acceptor
 
 
-def fleet_sources(fleet: Fleet) -> list[Source]:
+def fleet_sources(fleet: CockpitFleet) -> list[Source]:
     """Return the current sources of metrics: one per drone, and one for the fleet."""
     stations = fleet.stations.copy()
     return [partial(_fleet_readings, fleet), *(partial(_readings, name, one) for name, one in stations.items())]
 
 
-def _fleet_readings(fleet: Fleet) -> Iterator[Reading]:
+def _fleet_readings(fleet: CockpitFleet) -> Iterator[Reading]:
     yield Reading("skyloop_cockpit_unreachable", float(len(fleet.problems)))
 
 

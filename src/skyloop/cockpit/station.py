@@ -13,8 +13,8 @@ from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.actions import OUTDONE, OVERRULED
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import ThresholdReader
-from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, SmallFeed
+from skyloop.cockpit.discovery import FoundProxy
+from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, FeedFormat, SmallFeed
 from skyloop.cockpit.feeds import ROW_HZ, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.telemetry import TelemetryView
@@ -155,14 +155,14 @@ class Station:
     ``drone``: the drone, connected as an observer; closed by :meth:`close`.
     """
 
-    def __init__(self, found: Found, drone: Drone) -> None:
+    def __init__(self, found: FoundProxy, drone: Drone) -> None:
         self.found = found
         self.drone = drone
         self.event_feed = EventFeed(drone)
         self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: keyed by camera and width [pixels]
-        self.streams: dict[tuple[str, Form], EncodedFeed] = {}  #: H.264 streams by camera and encoding
+        self.streams: dict[tuple[str, FeedFormat], EncodedFeed] = {}  #: H.264 streams by camera and encoding
         self.goals: dict[str, Waypoint] = {}  #: goals to which pages are flying the drone, by application name
         self.routes = CheckedRoutes()
         self.sessions: set[FlyingSession] = set()  #: sessions of pages that may fly the drone
@@ -210,7 +210,7 @@ class Station:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
 
-    def encoded(self, name: str, form: Form) -> EncodedFeed:
+    def encoded(self, name: str, form: FeedFormat) -> EncodedFeed:
         """Return the feed of a camera's H.264 in one encoding; call :meth:`forget` once no page shows the feed."""
         if (name, form) not in self.streams:
             self.streams[name, form] = EncodedFeed(self.drone, name, form)

@@ -18,7 +18,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, Form, Numbered, SmallFrame, form_for, pack
+from skyloop.cockpit.encoded_feed import CameraFeed, EncodedFeed, FeedFormat, Numbered, SmallFrame, form_for, pack
 from skyloop.cockpit.feeds import PeriodicBroadcast, Wake
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
@@ -105,7 +105,7 @@ class Sent:
     """A picture for a page."""
 
     picture: EncodedFrame
-    form: Form
+    form: FeedFormat
     age_s: float
     late_here: bool = False  #: whether the page has its own stream because the pictures already reach the cockpit late
 
@@ -217,7 +217,7 @@ class PageStream:
         form = form_for(self._camera, self._width, self._max_fps)
         if self.path.update(self._clock(), self._late_s):
             self._name = self._name or self._station.own_name()
-            form = Form(None, form.scale, self._max_fps, self._name)
+            form = FeedFormat(None, form.scale, self._max_fps, self._name)
         for feed in filter(None, (self._next, self._feed)):
             if feed.silent_s > SILENT_S:
                 self._refuse(feed)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 
-from skyloop.client.frame import Arrival, compressed
+from skyloop.client.frame import ReceivedFrame, compressed
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.control.target_follower import detections_of
 from skyloop.errors import DecodeError, MissingExtraError, RefusedError, SkyloopError, UsageError
@@ -48,12 +48,12 @@ class KeptFrames:
     def __init__(self, most_bytes: int = KEPT_BYTES) -> None:
         self.bytes = 0  #: total size of the kept frames
         self._most_bytes = most_bytes
-        self._frames: deque[Arrival] = deque()
+        self._frames: deque[ReceivedFrame] = deque()
 
     def __len__(self) -> int:
         return len(self._frames)
 
-    def add(self, arrival: Arrival) -> None:
+    def add(self, arrival: ReceivedFrame) -> None:
         """Add a frame. If it is no newer than the last one (the proxy restarted), discard the frames kept so far."""
         if self._frames and arrival.header.captured_ns <= self._frames[-1].header.captured_ns:
             self.clear()
@@ -69,7 +69,7 @@ class KeptFrames:
         self._frames.clear()
         self.bytes = 0
 
-    def find(self, captured_ns: int) -> Arrival:
+    def find(self, captured_ns: int) -> ReceivedFrame:
         """Return the frame with this capture time; raise ``RefusedError``, which says why, if it was not kept."""
         for arrival in self._frames:
             if arrival.header.captured_ns == captured_ns:
@@ -86,7 +86,7 @@ class KeptFrames:
             f"{seconds(newest_ns - oldest_ns):.1f} s are kept: draw the box again"
         )
 
-    def next_after(self, captured_ns: int) -> Arrival | None:
+    def next_after(self, captured_ns: int) -> ReceivedFrame | None:
         """Return the next frame to track while catching up, or None if no frame is newer.
 
         This is the newest frame within :data:`STRIDE_S` after the last one or, if there is none, the first frame after
@@ -131,12 +131,12 @@ class FrameKeeper:
             drone.on_frame(self._on_frame, camera=camera, depth=_DEPTH),
         ]
 
-    def find(self, captured_ns: int) -> Arrival:
+    def find(self, captured_ns: int) -> ReceivedFrame:
         """Return the frame with this capture time; raise :class:`RefusedError` if it was not kept."""
         with self._news:
             return self._kept.find(captured_ns)
 
-    def catch_up(self, captured_ns: int) -> Arrival | None:
+    def catch_up(self, captured_ns: int) -> ReceivedFrame | None:
         """Return the next frame to track while catching up, or None if there is no newer frame."""
         with self._news:
             return self._kept.next_after(captured_ns)
@@ -256,7 +256,7 @@ class TargetTracker:
         self,
         drone: Drone,
         keeper: FrameKeeper,
-        begin: Arrival,
+        begin: ReceivedFrame,
         make: Callable[[], Follower],
         report: Callable[[TrackReport], None],
         clock: Clock = monotonic_ns,
@@ -267,7 +267,7 @@ class TargetTracker:
         self._applied: tuple[str, Any] = ("", None)
         self._drone = drone
         self._keeper = keeper
-        self._begin: Arrival | None = begin
+        self._begin: ReceivedFrame | None = begin
         self._make = make
         self._report = report
         self._clock = clock
@@ -310,7 +310,7 @@ class TargetTracker:
     def _catch_up(self, follower: Follower) -> None:
         """Track from the box's frame through the kept frames, for at most :data:`KEPT_S`."""
         until_ns = self._clock() + nanoseconds(KEPT_S)
-        arrival: Arrival | None
+        arrival: ReceivedFrame | None
         arrival, self._begin = self._begin, None
         while arrival is not None and not self._closed and self._clock() < until_ns:
             frame = arrival.frame()

@@ -28,7 +28,7 @@ from skyloop.zones import FAR_M, Box, Space, Zone, space_of
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.fleet import CockpitFleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.messages import CameraInfo, Feedback, Value
 
@@ -167,7 +167,7 @@ MAX_ASKING: Final = 4  #: maximum number of parallel requests to drones; each ma
 class WorldApi:
     """The routes ``world``, ``way`` and ``preflight`` of each drone. ``given``: the scenery if a drone reports none."""
 
-    def __init__(self, fleet: Fleet, recordings: Recordings, given: WorldGeometry | None) -> None:
+    def __init__(self, fleet: CockpitFleet, recordings: Recordings, given: WorldGeometry | None) -> None:
         self._fleet = fleet
         self._recordings = recordings
         self._given = given

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from skyloop.clock import seconds
 from skyloop.control.behaviour import SEARCHING, SEEN, Behaviour
-from skyloop.control.follow import FollowMarker, FollowSettings, Mode
+from skyloop.control.follow import FollowMarker, FollowPhase, FollowSettings
 from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
 from skyloop.control.limiting import clamped, require_positive
 from skyloop.control.path import Circle
@@ -81,7 +81,7 @@ class ApproachMarker(FollowMarker):
         super().on_frame(frame)
         law = self._follow_law
         there = (
-            self.mode is Mode.FOLLOWING
+            self.mode is FollowPhase.FOLLOWING
             and law.off_m is not None
             and law.off_m < self._near_m
             and law.aside_rad is not None
@@ -151,7 +151,7 @@ class OrbitMarker(FollowMarker):
         law = self._follow_law
         dt_s = 0.0 if self._last_ns is None else min(_LONGEST_STEP_S, seconds(frame.captured_ns - self._last_ns))
         self._last_ns = frame.captured_ns
-        going = self.mode is Mode.FOLLOWING and law.aside_rad is not None
+        going = self.mode is FollowPhase.FOLLOWING and law.aside_rad is not None
         law.station_rate_rad_s = self._rate if going else 0.0
         if law.aside_rad is not None and not going:
             law.station_rad = law.aside_rad  # continue from where the marker was found again

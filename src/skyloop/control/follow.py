@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
 
-class Mode(StrEnum):
+class FollowPhase(StrEnum):
     """The phases of :class:`FollowLaw`."""
 
     SEARCHING = "searching"  #: turning on the spot at a series of heights
@@ -70,7 +70,7 @@ class FollowLaw(VelocityLaw):
         self.settings = s = settings or FollowSettings()
         limits = SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2)
         super().__init__(limits, Part.VELOCITY)
-        self.mode = Mode.SEARCHING  #: phase at the last step
+        self.mode = FollowPhase.SEARCHING  #: phase at the last step
         #: Desired angle around the marker, counter-clockwise from its normal as seen from above [rad].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0  #: rate of change of ``station_rad``
@@ -108,9 +108,9 @@ class FollowLaw(VelocityLaw):
         ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         if unseen_s > self.settings.recovering_s:
-            self.mode, self.off_m = Mode.SEARCHING, None
+            self.mode, self.off_m = FollowPhase.SEARCHING, None
             return self._search.step(motion.yaw, self._altitude)
-        self.mode = Mode.FOLLOWING if unseen_s <= self.settings.following_s else Mode.RECOVERING
+        self.mode = FollowPhase.FOLLOWING if unseen_s <= self.settings.following_s else FollowPhase.RECOVERING
         wanted = self._follow(ahead, unseen_s)
         self._search.restart(turning=float(wanted[3]))
         return wanted
@@ -189,7 +189,7 @@ class TargetFilter:
         return unseen_s > 2.0 or (unseen_s >= 0.0 and off > max(1.0, 5 * math.sqrt(spread)))
 
 
-_COLOURS = {Mode.FOLLOWING: SEEN, Mode.RECOVERING: LOST, Mode.SEARCHING: SEARCHING}
+_COLOURS = {FollowPhase.FOLLOWING: SEEN, FollowPhase.RECOVERING: LOST, FollowPhase.SEARCHING: SEARCHING}
 
 
 @dataclass(slots=True)
@@ -236,7 +236,7 @@ class FollowMarker(Behaviour):
     """
 
     name = "follow"
-    losses = frozenset({Mode.RECOVERING, Mode.SEARCHING})
+    losses = frozenset({FollowPhase.RECOVERING, FollowPhase.SEARCHING})
 
     def __init__(
         self,
@@ -269,12 +269,12 @@ class FollowMarker(Behaviour):
         super().__init__(drone, self._follow_law, camera)
 
     @property
-    def mode(self) -> Mode:
+    def mode(self) -> FollowPhase:
         """The current phase: searching, following or recovering."""
         return self._follow_law.mode
 
     @property
-    def phase(self) -> Mode:
+    def phase(self) -> FollowPhase:
         """The same as :attr:`mode`, under the name common to all behaviours."""
         return self.mode
 

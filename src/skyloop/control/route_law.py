@@ -56,7 +56,7 @@ class RouteState(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class RouteCommand:
     """Send this action to the vehicle as a new command."""
 
     action: Position | Hover | Land
@@ -79,7 +79,7 @@ class Progress:
     text: str
 
 
-Effect = Command | TakePhoto | Progress
+Effect = RouteCommand | TakePhoto | Progress
 
 
 class RouteLaw:
@@ -132,7 +132,7 @@ class RouteLaw:
         if not self.is_under_way:
             return []
         self.state, self.problem = RouteState.PAUSED, why
-        return [Command(Hover()), self._report("paused", why or "as requested")]
+        return [RouteCommand(Hover()), self._report("paused", why or "as requested")]
 
     def resume(self) -> list[Effect]:
         """Continue straight to the next waypoint, or to the end of the route if all waypoints were skipped."""
@@ -155,7 +155,7 @@ class RouteLaw:
             return []
         under_way = self.is_under_way
         self.state = RouteState.STOPPED
-        return [*([Command(Hover())] if under_way else []), self._report("stopped", "as requested")]
+        return [*([RouteCommand(Hover())] if under_way else []), self._report("stopped", "as requested")]
 
     def photo_done(self, problem: str = "") -> None:
         """Report the result of the photo. Can be called from any thread."""
@@ -214,7 +214,7 @@ class RouteLaw:
     def _begin(self, action: Action) -> list[Effect]:
         here = self._goals[self.index]
         if isinstance(action, Look):
-            return [Command(Position(*here.position, self._yaw(action), self.route.speed_to(self.index)))]
+            return [RouteCommand(Position(*here.position, self._yaw(action), self.route.speed_to(self.index)))]
         if isinstance(action, Photo):
             self._photo = None
             return [TakePhoto(self.index + 1, action.camera)]
@@ -244,12 +244,12 @@ class RouteLaw:
 
     def _finish(self) -> list[Effect]:
         self.state = RouteState.DONE
-        return [Command(Hover() if self.route.end == "hover" else Land()), self._report("done", self.route.end)]
+        return [RouteCommand(Hover() if self.route.end == "hover" else Land()), self._report("done", self.route.end)]
 
     def _fly(self) -> list[Effect]:
         goal: Waypoint = self._goals[self.index].goal
         self.state, self.problem, self._deadline_ns, self._since_ns = RouteState.FLYING, "", None, None
-        return [Command(Position(*goal.position, goal.yaw, self.route.speed_to(self.index)))]
+        return [RouteCommand(Position(*goal.position, goal.yaw, self.route.speed_to(self.index)))]
 
     def _what(self) -> str:
         last = len(self.route.waypoints)
@@ -336,7 +336,7 @@ class FlyRoute(Controller):
         if refused := self._why_ended():
             effects = law.pause(refused)
             if refused == TAKEN:  # the other command is still in force, so don't hover
-                effects = [each for each in effects if not isinstance(each, Command)]
+                effects = [each for each in effects if not isinstance(each, RouteCommand)]
             self._carry_out(effects)
         self._carry_out(law.update(feedback, feedback.captured_ns))
         if law.over:
@@ -347,7 +347,7 @@ class FlyRoute(Controller):
 
     def _carry_out(self, effects: list[Effect]) -> None:
         for effect in effects:
-            if isinstance(effect, Command):
+            if isinstance(effect, RouteCommand):
                 self._leg = None
                 if isinstance(effect.action, Position):
                     self._leg = ask(self.drone, effect.action)

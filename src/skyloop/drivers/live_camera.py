@@ -20,7 +20,7 @@ from skyloop.address import without_secrets
 from skyloop.calibration import Calibration, load_calibration
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
-from skyloop.drivers.live_video import CheckedRelay, Coded, Decoder, LiveVideo, Picture, StreamRelay, VideoEvent
+from skyloop.drivers.live_video import CheckedRelay, Coded, Decoder, LiveFrame, LiveVideo, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
@@ -315,7 +315,7 @@ class LiveCamera:
         if self._checks:
             self._forward(coded)
 
-    def _show(self, picture: Picture) -> None:
+    def _show(self, picture: LiveFrame) -> None:
         picture.show(self._sink, self._settings.name, self._intrinsics(picture.width, picture.height))
 
     # On either thread --------------------------------------------------------------------------------------------

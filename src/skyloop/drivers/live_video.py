@@ -138,7 +138,7 @@ class Decoder(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class LiveFrame:
     """A frame from the vehicle's selected camera."""
 
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
@@ -220,7 +220,7 @@ class LiveVideo:
         *,
         connect: Callable[[int], Stream],
         make_decoder: Callable[[], Decoder],
-        show: Callable[[Picture], None],
+        show: Callable[[LiveFrame], None],
         on_event: Callable[[VideoEvent, str], None],
         wants: Callable[[], bool] = lambda: True,
         wants_checked: Callable[[], bool] = lambda: False,
@@ -366,7 +366,7 @@ class LiveVideo:
                     self._shown += 1
                     if not self._stop.is_set():
                         taken_ns = coded.captured_ns if captured_ns is None else captured_ns
-                        self._show(Picture(pixels, width, height, taken_ns, number))
+                        self._show(LiveFrame(pixels, width, height, taken_ns, number))
             except UnsupportedError as error:
                 refusals += 1
                 self._refused += 1

@@ -61,7 +61,7 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
     return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
-class Arrival(Enum):
+class PacketOrder(Enum):
     """How a packet's number relates to earlier numbers."""
 
     NEW = auto()
@@ -88,20 +88,20 @@ class RestartWatch:
         """Accept the next packet as new, because nothing has been received from the vehicle for a while."""
         self._newest = self._behind = None
 
-    def update(self, number: int, now_ns: int) -> Arrival:
+    def update(self, number: int, now_ns: int) -> PacketOrder:
         """Classify a packet that has just arrived, by its number."""
         step = 0 if self._newest is None else self._step(self._newest, number)
         if step >= -self._tolerance:
             self._newest, self._behind = number if step >= 0 else self._newest, None
-            return Arrival.NEW
+            return PacketOrder.NEW
         last, count, since_ns = self._behind or (number, 0, now_ns)
         if self._step(last, number) < 0:
             count, since_ns = 0, now_ns
         self._behind = number, count + 1, since_ns
         if count + 1 < RESTART_RUN or now_ns - since_ns < RESTART_SPAN_NS:
-            return Arrival.LATE
+            return PacketOrder.LATE
         self._newest, self._behind = number, None
-        return Arrival.RESTARTED
+        return PacketOrder.RESTARTED
 
     def _step(self, before: int, number: int) -> int:
         step = number - before

@@ -91,19 +91,19 @@ def serve(
         host.close(shutdown.reason, land_within_s, shutdown.hurry.is_set)
 
 
-def respond(host: Host, defaults: Defaults, request: Request) -> Answer:
+def respond(host: Host, defaults: Defaults, request: Request) -> HostAnswer:
     """Carry out a request, on that request's own thread. ``defaults`` are for vehicles specified only by address."""
     if isinstance(request, Remove):
-        return Answer((host.remove(request.name, land=request.land),))
+        return HostAnswer((host.remove(request.name, land=request.land),))
     if isinstance(request, AddNamed):
-        return Answer((_add_named(host, defaults, request).status(),))
+        return HostAnswer((_add_named(host, defaults, request).status(),))
     if isinstance(request, Add):
         present = {name for name, vehicle in host.vehicles.items() if vehicle.runs}
         new = [vehicle for vehicle in request.vehicles if vehicle.name not in present]
         problems = host.add_all(new)
         known = {vehicle.name for vehicle in request.vehicles}
-        return Answer(tuple(row for row in host.status() if row.name in known), problems)
-    return Answer(tuple(host.status()))
+        return HostAnswer(tuple(row for row in host.status() if row.name in known), problems)
+    return HostAnswer(tuple(host.status()))
 
 
 def _add_named(host: Host, defaults: Defaults, request: AddNamed) -> HostedVehicle:
@@ -152,7 +152,7 @@ def _key_changes(fleet: Fleet) -> list[Callable[[], list[str]]]:
     return list(polls.values())
 
 
-class Status(msgspec.Struct, frozen=True, tag="status"):
+class StatusRequest(msgspec.Struct, frozen=True, tag="status"):
     """Request the status of all vehicles."""
 
 
@@ -177,10 +177,10 @@ class Remove(msgspec.Struct, frozen=True, tag="remove"):
     land: bool = False
 
 
-Request = Status | Add | AddNamed | Remove
+Request = StatusRequest | Add | AddNamed | Remove
 
 
-class Answer(msgspec.Struct, frozen=True):
+class HostAnswer(msgspec.Struct, frozen=True):
     """The answer from a host."""
 
     vehicles: tuple[VehicleStatus, ...] = ()  #: all vehicles, or those in the request
@@ -191,9 +191,9 @@ class Answer(msgspec.Struct, frozen=True):
 
 
 _requests: Final[msgspec.json.Decoder[Request]] = decoder_of_handed(Request)
-_answers: Final = msgspec.json.Decoder(Answer)
+_answers: Final = msgspec.json.Decoder(HostAnswer)
 #: Carries out a request on the request's own thread. Raises :class:`skyloop.errors.SkyloopError`.
-Responder = Callable[[Request], Answer]
+Responder = Callable[[Request], HostAnswer]
 _ERRORS: Final[dict[str, type[SkyloopError]]] = {
     error.__name__: error for error in (UsageError, FileFormatError, NameTakenError, LinkError)
 }
@@ -254,10 +254,10 @@ class ControlServer:
             _log.info("an answer was not received: %s", error)
         sock.hang_up()
 
-    def _answer(self, sock: PacketSocket) -> Answer | None:
+    def _answer(self, sock: PacketSocket) -> HostAnswer | None:
         """Return the answer to a request; None if a client only checked whether a host exists."""
         if not self._directory.serving.may_connect(sock, self._directory.gid):
-            return Answer(error=f"{sock.who} may not use the host {self._name!r}", kind="RefusedError")
+            return HostAnswer(error=f"{sock.who} may not use the host {self._name!r}", kind="RefusedError")
         received = bytearray()
         while len(received) <= MAX_REQUEST and (packet := sock.recv(MAX_PACKET)):
             received += packet
@@ -270,19 +270,19 @@ class ControlServer:
             return None
         if len(received) > MAX_REQUEST:
             text = f"the request is longer than {MAX_REQUEST} bytes: add fewer vehicles at once"
-            return Answer(error=text, kind="RefusedError", code="malformed")
+            return HostAnswer(error=text, kind="RefusedError", code="malformed")
         try:
             request = _requests.decode(received)
         except (msgspec.DecodeError, RecursionError) as error:
-            return Answer(error=f"malformed request: {error}", kind="RefusedError", code="malformed")
+            return HostAnswer(error=f"malformed request: {error}", kind="RefusedError", code="malformed")
         try:
             return self._answering(request)
         except SkyloopError as error:
             code = error.code if isinstance(error, RefusedError) else ""
-            return Answer(error=reason_of(error), kind=type(error).__name__, code=code)
+            return HostAnswer(error=reason_of(error), kind=type(error).__name__, code=code)
         except Exception as error:  # noqa: BLE001  the host continues, and the caller gets an answer
             _log.exception("a request failed")
-            return Answer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
+            return HostAnswer(error=f"the host failed: {error!r}", kind="RefusedError", code="failed")
 
 
 def _send(sock: PacketSocket, text: bytes) -> None:
@@ -310,7 +310,7 @@ def chosen_host(name: str | None = None, group: str | None = None) -> str:
     return running[0]
 
 
-def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
+def ask(name: str, request: Request, *, group: str | None = None) -> HostAnswer:
     """Send a request to a host. Return or raise its answer, or raise :class:`LinkError` or :class:`NoAnswerError`."""
     directory = find_directory(group, HOST)
     try:

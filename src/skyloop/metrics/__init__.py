@@ -18,7 +18,7 @@ from skyloop.metrics.endpoint import FAMILIES, Endpoint, Reading, Source, serve
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.network.session import Session
+    from skyloop.network.session import FabricSession
     from skyloop.proxy import Proxy
 
 #: Counters of the proxy that are also metrics, such as ``skyloop_feedback_missed_total``. Counters that are absent are
@@ -125,7 +125,7 @@ def client_readings(name: str, drone: Drone) -> Iterator[Reading]:
                 yield Reading("skyloop_client_delay_seconds", value, (*labels, statistic))
 
 
-def router_readings(session: Callable[[], Session]) -> Source:
+def router_readings(session: Callable[[], FabricSession]) -> Source:
     """Return the source of a router's metrics."""
 
     def read() -> Iterator[Reading]:

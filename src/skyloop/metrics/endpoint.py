@@ -199,7 +199,7 @@ class Endpoint(AbstractContextManager["Endpoint"]):
         self.close()
 
 
-class Collector:
+class MetricsCollector:
     """Reads all sources on request, in the form that ``prometheus_client`` expects.
 
     If a source fails, it is skipped, counted and logged. The other sources are still served.
@@ -248,7 +248,7 @@ def _registry(sources: Callable[[], Iterable[Source]]) -> CollectorRegistry:
     except ImportError as error:
         raise MissingExtraError("metrics", "metrics", cause=str(error)) from None
     registry = CollectorRegistry()
-    registry.register(Collector(sources))
+    registry.register(MetricsCollector(sources))
     ProcessCollector(registry=registry)
     PlatformCollector(registry=registry)
     return registry

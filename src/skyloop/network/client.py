@@ -22,7 +22,7 @@ from skyloop.network.delivery import ACKNOWLEDGE_EVERY_S, DEPTH, AckPolicy, Outg
 from skyloop.network.discovery import SYNC_S, ProxyWatch, join, proxy_reached, renew
 from skyloop.network.frames import WINDOW
 from skyloop.network.sealing import Opener, contents
-from skyloop.network.session import Session, acquire, load, release, retire, undeclare
+from skyloop.network.session import FabricSession, acquire, load, release, retire, undeclare
 from skyloop.transport.base import (
     MAX_PACKET,
     ClientHandler,
@@ -138,7 +138,7 @@ class Subscription:
         self._newest = 0  # number of the newest frame received
         self._ended = False
 
-    def declare(self, session: Session, name: str, connection: str) -> list[Any]:
+    def declare(self, session: FabricSession, name: str, connection: str) -> list[Any]:
         """Subscribe on a Zenoh session. The caller must undeclare the returned declarations."""
         z, call, topic = session.zenoh, session.callback, self._topic
         if not topic.startswith(_VIDEO):
@@ -216,7 +216,7 @@ class FabricClient(TransportClient):
 
     def __init__(
         self,
-        session: Session,
+        session: FabricSession,
         name: str,
         handler: ClientHandler,
         find_s: float,

@@ -17,9 +17,9 @@ from skyloop.messages import FrameHeader, encode
 from skyloop.network import layout, packets
 from skyloop.network.admission import Admission
 from skyloop.network.delivery import DEPTH, MAX_BYTES, Outgoing, Pace, Receiver
-from skyloop.network.frames import FramePublisher, Variant
+from skyloop.network.frames import FramePublisher, FrameVariant
 from skyloop.network.sealing import Sealer
-from skyloop.network.session import Priority, Session, load
+from skyloop.network.session import FabricSession, Priority, load
 from skyloop.transport.base import MAX_SUBSCRIPTIONS, Peer, results, stream, too_many_topics, video
 from skyloop.transport.priority import PacketBacklog
 
@@ -184,14 +184,14 @@ class Publisher:
         self._clock = clock
         self.held_back = 0  #: number of packets that were skipped because all subscribers were silent
         self._lock = threading.RLock()  # guards the following attributes
-        self._session: Session | None = None  # set while publishing is possible
+        self._session: FabricSession | None = None  # set while publishing is possible
         self._subscribed: dict[str, tuple[ServerConnection, ...]] = {}
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._numbers: dict[str, int] = {}  # number of the last packet of each topic
         self._topic_problem: Callable[[str], str] = lambda _: ""
         self.video = FramePublisher(self._send_frame, name)
 
-    def open(self, session: Session, topic_problem: Callable[[str], str]) -> None:
+    def open(self, session: FabricSession, topic_problem: Callable[[str], str]) -> None:
         """Start publishing. ``topic_problem`` returns why a topic can't be subscribed to; empty if it can."""
         with self._lock:
             self._session = session
@@ -294,14 +294,14 @@ class Publisher:
                 self._numbers.pop(topic, None)
                 self._publishers.pop(topic, None)  # freed when its last user releases it
 
-    def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
+    def _declare(self, session: FabricSession, topic: str) -> zenoh.Publisher:
         newest_wins = layout.newest_wins(topic)
         usual: Priority = "DATA_LOW" if topic.startswith(_STREAMS) else "DATA"  # the same as for frames
         priority: Priority = "REAL_TIME" if newest_wins else usual
         return session.publisher(layout.topic(self._name, topic), priority, best_effort=newest_wins)
 
     def _send_frame(
-        self, variant: Variant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
+        self, variant: FrameVariant, number: int, header: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
     ) -> None:
         """Send an encoded frame. Called on the camera's thread."""
         session, request = self._session, variant.request

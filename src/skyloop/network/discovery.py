@@ -23,7 +23,7 @@ from skyloop.network import config, layout, packets
 from skyloop.network.admission import Admission, JoinRequest
 from skyloop.network.config import FabricSettings, Part
 from skyloop.network.packets import ProxyInfo
-from skyloop.network.session import Session, acquire, configure, host_name, load, release, retire
+from skyloop.network.session import FabricSession, acquire, configure, host_name, load, release, retire
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,12 +68,12 @@ def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
         release(session)
 
 
-def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
+def oldest_first(session: FabricSession, name: str) -> list[ProxyInfo]:
     """Return the proxies with this name, oldest first, using an open session."""
     return sorted(_ask(session, name), key=lambda about: about.since_ns)
 
 
-def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
+def runs(session: FabricSession, name: str = "*") -> set[tuple[str, str]]:
     """Return NAME and RUN of the transport servers whose tokens are currently visible.
 
     This call takes as long as the linked nodes need to send their tokens, but no more than :data:`SYNC_S`.
@@ -81,7 +81,7 @@ def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
     return listed(session, name)[0]
 
 
-def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
+def listed(session: FabricSession, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
     """Return the result of :func:`runs`, and whether the linked nodes have sent all their tokens."""
     found = set()
     deadline = time.monotonic() + within_s
@@ -94,12 +94,12 @@ def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tu
     return found, time.monotonic() < deadline
 
 
-def _settle(session: Session) -> None:
+def _settle(session: FabricSession) -> None:
     """Wait until a new session knows the nodes within reach."""
     time.sleep(max(0.0, session.opened + SETTLE_S - time.monotonic()))
 
 
-def _ask(session: Session, name: str) -> list[ProxyInfo]:
+def _ask(session: FabricSession, name: str) -> list[ProxyInfo]:
     z = load()
     found: dict[str, ProxyInfo] = {}
     replies = session.zenoh.get(
@@ -156,7 +156,7 @@ def proxy_reached() -> None:
         _UNREACHABLE.clear()
 
 
-def renew(session: Session) -> bool:
+def renew(session: FabricSession) -> bool:
     """Search for nodes that a session does not know about. If new ones answer, retire the session and return True."""
     if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
@@ -169,7 +169,7 @@ def renew(session: Session) -> bool:
     return found
 
 
-def _search(session: Session) -> set[str]:
+def _search(session: FabricSession) -> set[str]:
     """Return the identities of the nodes that currently answer and accept connections."""
     answered: set[str] = set()
 
@@ -194,7 +194,7 @@ class ProxyWatch:
     """
 
     def __init__(
-        self, session: Session, name: str, on_gone: Callable[[str], None], known: packets.ProxyInfo | None = None
+        self, session: FabricSession, name: str, on_gone: Callable[[str], None], known: packets.ProxyInfo | None = None
     ) -> None:
         self._session = session
         self._name = name
@@ -261,7 +261,7 @@ class ProxyWatch:
             self._on_gone(run)
 
 
-def join(session: Session, name: str, run: str, connection: str) -> Admission:
+def join(session: FabricSession, name: str, run: str, connection: str) -> Admission:
     """Ask one run of a proxy to admit a connection, and return the connection's terms."""
     z, who, ring = load(), session.settings.who, session.settings.ring
     request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))

@@ -32,7 +32,7 @@ LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
 #: Sends one encoded frame of a variant, either to all readers of the variant or only to the given connections.
-Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
+Send = Callable[["FrameVariant", int, FrameHeader, bytes, "tuple[Hashable, ...] | None"], None]
 
 
 @dataclass(slots=True)
@@ -77,7 +77,7 @@ class Reader:
             self._on_way.popleft()
 
 
-class Variant:
+class FrameVariant:
     """One of a camera's frame formats, with the connections that read it."""
 
     def __init__(self, request: VideoRequest) -> None:
@@ -97,7 +97,7 @@ class FramePublisher:
         self._name = name
         self._clock = clock
         self._changed = threading.Condition()
-        self._variants: dict[str, dict[str, Variant]] = {}  # by camera and topic
+        self._variants: dict[str, dict[str, FrameVariant]] = {}  # by camera and topic
         self._threads: dict[str, threading.Thread] = {}
         self._number = 0
         self._ended = False
@@ -146,7 +146,7 @@ class FramePublisher:
                 return False
             request = VideoRequest.parse(topic)
             variants = self._variants.setdefault(request.camera, {})
-            variants.setdefault(topic, Variant(request)).readers.setdefault(key, Reader())
+            variants.setdefault(topic, FrameVariant(request)).readers.setdefault(key, Reader())
             if request.camera not in self._threads:
                 thread = threading.Thread(
                     target=self._run, args=(request.camera,), name=f"skyloop-{self._name}-video", daemon=True
@@ -241,7 +241,7 @@ class FramePublisher:
             except Exception:  # noqa: BLE001  (lose one frame; the next may succeed)
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
-    def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
+    def _next(self, camera: str) -> tuple[FrameVariant, PublishedFrame, tuple[Hashable, ...] | None] | None:
         """Wait until a variant's newest frame is due for readers; return variant, frame and readers (None: all).
 
         None at the end, or if the camera has no readers.
@@ -263,7 +263,7 @@ class FramePublisher:
             self._threads.pop(camera, None)
         return None
 
-    def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
+    def _encoded(self, variant: FrameVariant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
         """Encode a frame as requested. If that fails, return the frame unencoded and log the failure once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)

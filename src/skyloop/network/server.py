@@ -21,7 +21,7 @@ from skyloop.network.config import FabricSettings, Part
 from skyloop.network.connection import MAX_WAITING, Publisher, Sender, ServerConnection
 from skyloop.network.registry import ConnectionRegistry, HandlerQueue, Item
 from skyloop.network.sealing import PLAIN, TopicSeal, contents
-from skyloop.network.session import Session, acquire, host_name, load, release, undeclare
+from skyloop.network.session import FabricSession, acquire, host_name, load, release, undeclare
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.priority import SUPERSEDED, is_command
@@ -72,7 +72,7 @@ class FabricServer(TransportServer):
         self._lock = threading.Lock()  # guards starting and stopping
         self._started = False
         self._since_ns = 0  # wall-clock time when it started
-        self._session: Session | None = None
+        self._session: FabricSession | None = None
         self._declared: list[Any] = []
         self._thread: threading.Thread | None = None
         self.refused = 0  #: number of packets that were not allowed on their key
@@ -105,7 +105,7 @@ class FabricServer(TransportServer):
                 f"{taken.host} (pid {taken.pid}): choose another, or stop that one"
             )
 
-    def _declare(self, session: Session) -> None:
+    def _declare(self, session: FabricSession) -> None:
         z, name, call = session.zenoh, self._name, session.callback
         for way in layout.WAYS:
             self._declared.append(z.declare_subscriber(layout.upward(way, name, "*", "*"), call(self._on_packet)))

@@ -34,7 +34,7 @@ _ATTEMPTS: Final = 5  # number of attempts to get a free port before another pro
 Priority = Literal["REAL_TIME", "DATA_HIGH", "DATA", "DATA_LOW"]  #: the Zenoh priorities in use, highest first
 
 
-class Session:
+class FabricSession:
     """A shared Zenoh session. Give it back with :func:`release`."""
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
@@ -117,12 +117,12 @@ class _Pool:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._sessions: list[Session] = []
+        self._sessions: list[FabricSession] = []
         self._closing = 0  # number of sessions that are being closed and are no longer in the list
         self._over = False  # the process is exiting
         self._reaper: threading.Thread | None = None
 
-    def acquire(self, settings: FabricSettings, part: Part) -> Session:
+    def acquire(self, settings: FabricSettings, part: Part) -> FabricSession:
         """Return a session with these settings, opening one if necessary."""
         with self._changed:
             if self._over:
@@ -132,12 +132,12 @@ class _Pool:
                 if same and not session.retired and not session.zenoh.is_closed():
                     session.users += 1
                     return session
-            session = Session(settings, part)
+            session = FabricSession(settings, part)
             session.users = 1
             self._sessions.append(session)
             return session
 
-    def release(self, session: Session, *, linger: bool = True) -> None:
+    def release(self, session: FabricSession, *, linger: bool = True) -> None:
         """Give a session back. Once unused, the session stays open for :data:`LINGER_S` if it may linger."""
         with self._changed:
             session.users -= 1
@@ -152,7 +152,7 @@ class _Pool:
         if at_once:
             self._close(session)
 
-    def retire(self, session: Session) -> None:
+    def retire(self, session: FabricSession) -> None:
         """Give new users another session from now on. This session closes once its last user has left."""
         with self._changed:
             session.retired = True
@@ -172,12 +172,12 @@ class _Pool:
             self._changed.notify_all()
             self._changed.wait_for(lambda: not self._closing, CLOSE_S)
 
-    def _take_out(self, session: Session) -> None:
+    def _take_out(self, session: FabricSession) -> None:
         """Start closing a session. The caller holds the lock. The caller must then call :meth:`_close`."""
         self._sessions.remove(session)
         self._closing += 1
 
-    def _close(self, session: Session) -> None:
+    def _close(self, session: FabricSession) -> None:
         """Close a session outside the lock, because closing may wait for the network."""
         try:
             session.close()
@@ -229,7 +229,7 @@ def host_name() -> str:
     return platform.node()[:64] or "?"
 
 
-def renewed(session: Session) -> Session:
+def renewed(session: FabricSession) -> FabricSession:
     """Replace a session that has no other users with a session at the same addresses that uses the newest roster.
 
     All links of the session are closed and re-established. Raises :class:`LinkError` if the keys were revoked, or if an

@@ -19,7 +19,7 @@ _PAUSE_S: Final = 1.0  #: delay before restarting a worker that died
 USAGE_ERROR: Final = 2  #: exit code of a child that can't run at all and has printed the reason
 
 
-class Worker:
+class WorkerProcess:
     """A worker's process, which is restarted ``pause_s`` [s] after it dies.
 
     ``command`` must regularly print a :class:`Status` as a JSON line on standard output. ``report`` is called on the
@@ -51,14 +51,14 @@ class Worker:
         return self._pause_s
 
 
-class Group:
+class ProcessGroup:
     """Several children running the same command. Leaving its ``with`` block ends them."""
 
     def __init__(
         self, command: Sequence[str], count: int, report: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
         """Start ``count`` children; when one dies, ``report`` is called with a message on its monitoring thread."""
-        self._workers = [Worker(number, tuple(command), report, pause_s) for number in range(1, count + 1)]
+        self._workers = [WorkerProcess(number, tuple(command), report, pause_s) for number in range(1, count + 1)]
 
     @property
     def status(self) -> Status | None:

@@ -21,7 +21,7 @@ import msgspec
 
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import Mailbox, checked_age, checked_name
-from skyloop.client.frame import Arrival
+from skyloop.client.frame import ReceivedFrame
 from skyloop.client.publishing import Membership
 from skyloop.client.video import VideoChannel
 from skyloop.clock import NS_PER_S, Clock, monotonic_ns
@@ -274,7 +274,7 @@ class Worker:
             raise refused
         return self._stopped.is_set() or self._drone.closed or time.monotonic() >= end_s
 
-    def _work(self, arrival: Arrival) -> None:
+    def _work(self, arrival: ReceivedFrame) -> None:
         limit_s = self.settings.max_age_s
         if limit_s is not None and arrival.age_s > limit_s:
             self._tally.stale += 1
@@ -353,7 +353,7 @@ class Frames:
         self._max_fps = max_fps
         self._usual = video_channel(drone, membership.camera)
         self._channel: VideoChannel | None = None  # the current subscription
-        self._buffer: Mailbox[Arrival] = Mailbox()
+        self._buffer: Mailbox[ReceivedFrame] = Mailbox()
         self._sink = self._arrived
         self._lock = threading.Lock()  # guards the change of channels
 
@@ -374,11 +374,11 @@ class Frames:
         """Number of frames in the share that were replaced by newer ones."""
         return self._buffer.dropped
 
-    def wait(self, timeout_s: float) -> Arrival | None:
+    def wait(self, timeout_s: float) -> ReceivedFrame | None:
         """Return the newest frame, or None if none arrives within ``timeout_s`` [s]."""
         return self._buffer.wait(timeout_s)
 
-    def picture(self, arrival: Arrival) -> Frame | None:
+    def picture(self, arrival: ReceivedFrame) -> Frame | None:
         """Decode the frame; return None if decoding fails (the frame's channel counts failures)."""
         return (self._channel or self._usual).picture(arrival)
 
@@ -399,7 +399,7 @@ class Frames:
             if before is not None:
                 before.remove(self._sink)
 
-    def _arrived(self, arrival: Arrival) -> None:
+    def _arrived(self, arrival: ReceivedFrame) -> None:
         share = self._membership.share  # the frame may belong to an earlier share
         if share is not None and share.parts and arrival.header.seq % share.parts == share.part:
             self._came()

@@ -25,7 +25,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.messages.feedback import MAX_LINK_TEXT
-from skyloop.proxy.core.autopilot import PATIENCE_NS, Autopilot, software_actions
+from skyloop.proxy.core.autopilot import PATIENCE_NS, SoftwareAutopilot, software_actions
 from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import FailsafeLadder
 from skyloop.proxy.core.flight import STALE_NS, Changed, Flight, Snapshot
@@ -41,7 +41,7 @@ class ActionExecutor:
         driver: Driver,
         capabilities: Capabilities,
         flight: Flight,
-        autopilot: Autopilot | None,
+        autopilot: SoftwareAutopilot | None,
         publisher: VehiclePublisher,
     ) -> None:
         software = software_actions(capabilities.actions)

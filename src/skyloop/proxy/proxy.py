@@ -54,7 +54,7 @@ from skyloop.messages import (
     Welcome,
     decode,
 )
-from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
+from skyloop.proxy.core.autopilot import PERIOD_S, SoftwareAutopilot, software_actions
 from skyloop.proxy.core.flight import Flight
 from skyloop.proxy.events import Counters, EventDraft, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
@@ -113,7 +113,7 @@ class Proxy:
         self.events = EventPublisher(server_end.publish, clock, self._counters, driver.uri.scrub)
         steerable = bool(self.capabilities.actions & {"attitude", "velocity"})
         flight = Flight(self.capabilities.actions, shared=driver.shared)
-        autopilot = Autopilot(self.capabilities.actions, flight=flight) if steerable else None
+        autopilot = SoftwareAutopilot(self.capabilities.actions, flight=flight) if steerable else None
         self.publisher = VehiclePublisher(
             server=server_end,
             events=self.events,

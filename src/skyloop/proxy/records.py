@@ -41,7 +41,7 @@ NOTE_SUFFIX: Final = ".flight"
 _log = logging.getLogger(__name__)
 
 
-class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
+class AuditEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     """One line of an audit trail. The line's other fields depend on ``what``."""
 
     at: datetime  #: wall-clock time, UTC
@@ -68,11 +68,11 @@ class Tenure(msgspec.Struct, frozen=True):
     takeoffs: int = 0
 
 
-def entry_of(event: Event, at: datetime, proxy: str, run: str) -> Entry | None:
+def entry_of(event: Event, at: datetime, proxy: str, run: str) -> AuditEntry | None:
     """Return the line for an event; None if the trail does not record such events."""
     data, who = event.data, event.app or ""
     lease = data.get("lease")
-    numbered = Entry(at, proxy, run, "", who, lease=lease if isinstance(lease, int) else 0)
+    numbered = AuditEntry(at, proxy, run, "", who, lease=lease if isinstance(lease, int) else 0)
     filled = msgspec.structs.replace
     if event.kind is EventKind.AUTHORITY_GRANTED:
         priority = data.get("priority")
@@ -90,7 +90,7 @@ def entry_of(event: Event, at: datetime, proxy: str, run: str) -> Entry | None:
     return filled(numbered, what="end", how=event.text) if event.kind is EventKind.PROXY_CLOSING else None
 
 
-def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
+def _of_state(entry: AuditEntry, before: object, after: object) -> AuditEntry | None:
     states = frozenset(FlightState)
     if before not in states or after not in states:
         return None
@@ -100,7 +100,7 @@ def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
     return msgspec.structs.replace(entry, what="takeoff" if now else "landed")
 
 
-def tenures(entries: Iterable[Entry]) -> list[Tenure]:
+def tenures(entries: Iterable[AuditEntry]) -> list[Tenure]:
     """Return all tenures in the order of their grants. Entries of several proxies may be mixed."""
     done: list[Tenure] = []
     held: dict[str, int] = {}
@@ -122,7 +122,7 @@ def tenures(entries: Iterable[Entry]) -> list[Tenure]:
     return done
 
 
-def read(path: Path) -> tuple[list[Entry], int]:
+def read(path: Path) -> tuple[list[AuditEntry], int]:
     """Return a file's entries, and the number of unreadable lines (for example, lines cut off by a crash)."""
     try:
         lines = path.read_bytes().splitlines()
@@ -131,7 +131,7 @@ def read(path: Path) -> tuple[list[Entry], int]:
     entries, bad = [], 0
     for line in lines:
         try:
-            entries.append(msgspec.json.decode(line, type=Entry))
+            entries.append(msgspec.json.decode(line, type=AuditEntry))
         except (msgspec.DecodeError, RecursionError):
             bad += 1
     return entries, bad
@@ -157,7 +157,7 @@ class AuditTrail:
         self._proxy = proxy
         self._run = run
         self._wall = wall or (lambda: datetime.now(UTC))
-        self._queue: SimpleQueue[Entry | None] = SimpleQueue()
+        self._queue: SimpleQueue[AuditEntry | None] = SimpleQueue()
         self._failed = False
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0), _MODE)
@@ -165,7 +165,7 @@ class AuditTrail:
         self._thread.start()
 
     def begin(self, uri: str) -> None:
-        self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
+        self._queue.put(AuditEntry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:
         """Record an event. Thread-safe."""

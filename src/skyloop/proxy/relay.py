@@ -246,7 +246,7 @@ class ProcessorWorkers:
 
 
 @dataclass(slots=True)
-class Worker:
+class ProcessorWorker:
     """One application as a worker for one processor."""
 
     asked: JoinProcessor
@@ -262,13 +262,13 @@ class WorkerRoster:
     """The workers of all processors, by application and processor name."""
 
     def __init__(self) -> None:
-        self._workers: dict[_Key, Worker] = {}
+        self._workers: dict[_Key, ProcessorWorker] = {}
 
-    def find(self, app_id: int, processor: str) -> Worker | None:
+    def find(self, app_id: int, processor: str) -> ProcessorWorker | None:
         return self._workers.get((app_id, processor))
 
     def register(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
-        self._workers[app_id, asked.processor] = Worker(asked, now_ns)
+        self._workers[app_id, asked.processor] = ProcessorWorker(asked, now_ns)
 
     def remove(self, app_id: int) -> list[JoinProcessor]:
         """Remove an application, and return the processors that it worked for."""

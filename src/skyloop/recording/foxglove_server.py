@@ -35,7 +35,7 @@ from skyloop.recording.foxglove import CompressedVideo
 from skyloop.recording.layout import Channel, ClockPair, FrameRecord, Topic
 from skyloop.recording.options import VIDEO
 from skyloop.recording.taps import Parameters, Source, check_names
-from skyloop.recording.translation import Message, Picture, Schema, Translator
+from skyloop.recording.translation import Message, Schema, TranslatedImage, Translator
 
 PORT: Final = 8765  #: Foxglove's default
 WAITING: Final = 512  #: number of messages queued per viewer before the oldest are dropped
@@ -138,7 +138,7 @@ class FoxgloveServer:
     def show(self, item: Item) -> None:
         """Send a sample's messages to the viewers subscribed to them."""
         for message in self._translators[item.drone].messages(item):
-            if isinstance(item.sample, Picture) and not self._decodable(message, item.sample):
+            if isinstance(item.sample, TranslatedImage) and not self._decodable(message, item.sample):
                 continue
             self._send(message)
 
@@ -158,7 +158,7 @@ class FoxgloveServer:
                 if message.topic in began:
                     self._send(message)
 
-    def _decodable(self, message: Message, picture: Picture) -> bool:
+    def _decodable(self, message: Message, picture: TranslatedImage) -> bool:
         """Return whether viewers can decode a message, given the messages already sent; a key frame must come first."""
         record = picture.record
         if record.format != H264 or message.kind is not CompressedVideo:

@@ -159,7 +159,7 @@ class RecorderEvent(msgspec.Struct, frozen=True):
     severity: Severity = Severity.INFO
 
 
-class Room(StrEnum):
+class DiskRoom(StrEnum):
     """The samples that are still written when the disk is nearly full."""
 
     ALL = "all"
@@ -170,13 +170,13 @@ class Room(StrEnum):
 _MARGIN: Final = 1.25  #: free space required before writing resumes, as a multiple of the limit
 
 
-def judge_room(free: int, floor: int, before: Room) -> Room:
+def judge_room(free: int, floor: int, before: DiskRoom) -> DiskRoom:
     """Decide what to write: everything above the floor, no frames below it, nothing below a quarter of it.
 
     To write more than ``before``, the free space must exceed the limit by an extra margin.
     """
-    margin = _MARGIN if before is not Room.ALL else 1.0
+    margin = _MARGIN if before is not DiskRoom.ALL else 1.0
     if free >= floor * margin:
-        return Room.ALL
-    margin = _MARGIN if before is Room.NOTHING else 1.0
-    return Room.NO_FRAMES if free >= floor / 4 * margin else Room.NOTHING
+        return DiskRoom.ALL
+    margin = _MARGIN if before is DiskRoom.NOTHING else 1.0
+    return DiskRoom.NO_FRAMES if free >= floor / 4 * margin else DiskRoom.NOTHING

@@ -30,7 +30,7 @@ _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class RecordedImage:
     """A frame of a recording, with its image."""
 
     camera: str
@@ -38,7 +38,7 @@ class Picture:
     log_ns: int  #: time at which it was received, Unix time [ns]
     publish_ns: int  #: time at which it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: the frame's group and its index in it, for decodable H.264
+    group: tuple[FrameGroup, int] | None = None  #: the frame's group and its index in it, for decodable H.264
 
     @property
     def header(self) -> FrameHeader:
@@ -159,7 +159,7 @@ def _varint(message: bytes, at: int) -> tuple[int, int]:
 # H.264 ----------------------------------------------------------------------------------------------------------
 
 
-class Group:
+class FrameGroup:
     """A key frame and the frames that depend on it, in the order of capture. Decoding resumes where it stopped."""
 
     def __init__(self) -> None:
@@ -196,9 +196,9 @@ class Groups:
 
     def __init__(self) -> None:
         self._chain = Chain()
-        self._group = Group()
+        self._group = FrameGroup()
 
-    def add(self, number: int, unit: bytes, *, key: bool) -> tuple[Group, int] | None:
+    def add(self, number: int, unit: bytes, *, key: bool) -> tuple[FrameGroup, int] | None:
         """Add a frame.
 
         Returns:
@@ -207,7 +207,7 @@ class Groups:
         if not self._chain.follows(number, key=key):
             return None
         if key:
-            self._group = Group()
+            self._group = FrameGroup()
         self._group.add(unit)
         return self._group, len(self._group) - 1
 

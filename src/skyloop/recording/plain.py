@@ -336,7 +336,7 @@ def shifted(value: Any, shift_ns: int) -> Any:
     return value if record is None else replace(value, record=shifted(record, shift_ns))
 
 
-class Course:
+class TimeCourse:
     """Tracks the time along a recording, sample by sample. It never runs backwards, and a single wrong time is ignored.
 
     If the proxy's clock restarts because its computer was rebooted, time continues from the last value, advanced by the

@@ -18,7 +18,7 @@ from skyloop.messages.frame import H264
 from skyloop.recording import layout, scan
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, End, FrameRecord, Start, Topic
 from skyloop.recording.listing import Described, describe, shown_name
-from skyloop.recording.pictures import Groups, Picture, compressed
+from skyloop.recording.pictures import Groups, RecordedImage, compressed
 from skyloop.recording.scan import Message, Piece, Scan
 
 __all__ = ["Described", "Entry", "Item", "Recording", "Series", "describe", "shown_name"]
@@ -239,8 +239,8 @@ class Recording:
         progress: Progress | None = None,
         *,
         from_ns: int = 0,
-    ) -> Iterator[Item | Picture]:
-        """Yield samples like :meth:`items`, but combine each frame's record and image into a :class:`Picture`.
+    ) -> Iterator[Item | RecordedImage]:
+        """Yield samples like :meth:`items`, but combine each frame's record and image into a :class:`RecordedImage`.
 
         Args:
             drone: The drone's name.
@@ -251,7 +251,7 @@ class Recording:
         images = _image_topics(drone, self.cameras(drone))
         return self._paired(self._topics(drone, channels), images, progress, from_ns)
 
-    def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[Picture]:
+    def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[RecordedImage]:
         """Yield the frames of one camera.
 
         Raises:
@@ -262,7 +262,7 @@ class Recording:
             raise UnknownNameError(f"camera of {drone} in {self.path}", camera, known)
         frames = Topic(drone, Channel.FRAMES, camera)
         found = self._paired({str(frames): frames}, _image_topics(drone, (camera,)), progress)
-        return (picture for picture in found if isinstance(picture, Picture))
+        return (picture for picture in found if isinstance(picture, RecordedImage))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
         """Decode a message from one of Skyloop's own channels; note damage in :attr:`damaged` and return None."""
@@ -289,7 +289,7 @@ class Recording:
 
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
-    ) -> Iterator[Item | Picture]:
+    ) -> Iterator[Item | RecordedImage]:
         """Yield the samples of the given topics, with frames as pictures instead of records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
@@ -332,16 +332,16 @@ class _Pairs:
         self._images: dict[_Kind, Entry] = {}
         self._groups: dict[str, Groups] = {}
 
-    def record(self, camera: str, entry: Entry, record: FrameRecord) -> Picture | None:
+    def record(self, camera: str, entry: Entry, record: FrameRecord) -> RecordedImage | None:
         kind = camera, record.format == H264
         self._records[kind] = entry, record
         return self._pair(kind)
 
-    def image(self, kind: _Kind, entry: Entry) -> Picture | None:
+    def image(self, kind: _Kind, entry: Entry) -> RecordedImage | None:
         self._images[kind] = entry
         return self._pair(kind)
 
-    def _pair(self, kind: _Kind) -> Picture | None:
+    def _pair(self, kind: _Kind) -> RecordedImage | None:
         image, known = self._images.get(kind), self._records.get(kind)
         if image is None or known is None or image.sequence != known[0].sequence:
             return None
@@ -352,7 +352,7 @@ class _Pairs:
             groups = self._groups.setdefault(camera, Groups())
             with suppress(FileFormatError):  # raised when a picture without a group is decoded
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
-        return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
+        return RecordedImage(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 
 
 def _foreign(found: Scan) -> str:

@@ -55,11 +55,10 @@ from skyloop.platform import end_session, own_session
 from skyloop.recording.backlog import Item
 from skyloop.recording.layout import Channel, ClockPair, DroneRecord, FrameRecord
 from skyloop.recording.options import MB, VIDEO
-from skyloop.recording.pictures import Picture as RecordedPicture
+from skyloop.recording.pictures import RecordedImage
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.taps import Source, check_names
-from skyloop.recording.translation import Path as Trail
-from skyloop.recording.translation import Picture
+from skyloop.recording.translation import Trail, TranslatedImage
 
 PORT: Final = 9876  #: default port of Rerun's viewer
 _START_S: Final = 20.0  # time allowed for the viewer to start listening
@@ -135,7 +134,7 @@ class RerunViewer:
             self.left_out += 1
             return
         sample = item.sample
-        if not isinstance(sample, Picture):
+        if not isinstance(sample, TranslatedImage):
             self._shown.add(item.drone, sample)
         elif self._decodable(item, sample.record):
             self._shown.add_picture(item.drone, sample.record, sample.data)
@@ -253,7 +252,7 @@ def export_rrd(
         first = number / len(chosen)
         report = None if progress is None else _part_of(progress, first, len(chosen))
         for item in recording.items_and_pictures(each.name, _CHANNELS, report):
-            if not isinstance(item, RecordedPicture):
+            if not isinstance(item, RecordedImage):
                 log.add(number, item.value)
                 samples += 1
                 continue

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyloop.client import Drone, Result
 from skyloop.client.channels import Listener, Mailbox
-from skyloop.client.frame import Arrival, to_bgr
+from skyloop.client.frame import ReceivedFrame, to_bgr
 from skyloop.clock import beats, nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError, UsageError
 from skyloop.extend import Known, stream_channel, video_channel
@@ -36,7 +36,7 @@ from skyloop.platform import lower_priority
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import Channel, Drops, FrameRecord
 from skyloop.recording.options import MB, VIDEO, Options
-from skyloop.recording.translation import Picture
+from skyloop.recording.translation import TranslatedImage
 
 _FRAMES_WAITING: Final = 2  # frames besides the one being encoded and the one arriving; a client can't hold more slots
 _SIZE: Final = 400  #: approximate size of a typical sample [bytes]
@@ -222,7 +222,7 @@ class Stream:
         header = picture.decoded(picture.width, picture.height)
         record = FrameRecord(header, now_ns, H264, picture.key)
         size = len(picture.data) + _SIZE
-        self._put(self._channel, Rank.FRAME, Picture(record, picture.data), size, now_ns)
+        self._put(self._channel, Rank.FRAME, TranslatedImage(record, picture.data), size, now_ns)
 
 
 class Video:
@@ -248,7 +248,7 @@ class Video:
         self._lock = threading.Lock()  # guards the subscription to frames
         self._listening = self._ended = False
         self._failed = 0
-        self._buffer: Mailbox[Arrival] = Mailbox(_FRAMES_WAITING)
+        self._buffer: Mailbox[ReceivedFrame] = Mailbox(_FRAMES_WAITING)
         self._sink = self._arrived
         self._thread = threading.Thread(target=self._run, name=f"skyloop-record-{camera}", daemon=True)
 
@@ -297,7 +297,7 @@ class Video:
             else:
                 self._topic.remove(self._sink)
 
-    def _arrived(self, arrival: Arrival) -> None:
+    def _arrived(self, arrival: ReceivedFrame) -> None:
         if self._stream is not None and arrival.received_ns - self._stream.newest_ns < _STREAM_GONE_NS:
             return  # the stream has returned and is recorded instead
         header = arrival.header
@@ -316,7 +316,7 @@ class Video:
                 self._encode_one(arrival)
             del arrival  # otherwise its frame slot would remain leased during the wait for the next frame
 
-    def _encode_one(self, arrival: Arrival) -> None:
+    def _encode_one(self, arrival: ReceivedFrame) -> None:
         try:
             raw = arrival.as_came()
             header = arrival.header
@@ -332,9 +332,9 @@ class Video:
             if not isinstance(error, SkyloopError):
                 _log.exception("frame %s of %s can't be recorded", arrival.header.seq, arrival.header.camera)
 
-    def _done(self, arrival: Arrival, data: bytes, format_: str) -> None:
+    def _done(self, arrival: ReceivedFrame, data: bytes, format_: str) -> None:
         record = FrameRecord(arrival.header, arrival.received_ns, format_)
-        self._put(self.channel, Rank.FRAME, Picture(record, data), len(data) + _SIZE, arrival.received_ns)
+        self._put(self.channel, Rank.FRAME, TranslatedImage(record, data), len(data) + _SIZE, arrival.received_ns)
 
 
 def encoder(options: Options) -> Encode:

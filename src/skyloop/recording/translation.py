@@ -67,14 +67,14 @@ class Schema:
 
 
 @dataclass(slots=True, eq=False)
-class Picture:
+class TranslatedImage:
     """A frame as it is written to the file."""
 
     record: FrameRecord
     data: bytes
 
 
-class Path:
+class Trail:
     """The points of a drone's path, oldest first, thinned to a limited number."""
 
     def __init__(self) -> None:
@@ -109,7 +109,7 @@ class Translator:
         }
         self._parameters: dict[str, Parameter] = {}
         self._intrinsics: dict[str, tuple[int, int, Intrinsics]] = {}
-        self._path = Path()
+        self._path = Trail()
         self._path_due_ns = 0
         self._makers: dict[type, Callable[[Any, int], Iterator[Message]]] = {
             Feedback: self._feedback,
@@ -119,7 +119,7 @@ class Translator:
             Annotation: self._annotation,
             LogEntry: self._log,
             ProcessorResult: self._result,
-            Picture: self._picture,
+            TranslatedImage: self._picture,
             Drops: self._drops,
         }
 
@@ -222,7 +222,7 @@ class Translator:
     def _drops(self, drops: Drops, log_ns: int) -> Iterator[Message]:
         yield self._own(Channel.DROPS, drops, log_ns, log_ns)
 
-    def _picture(self, picture: Picture, log_ns: int) -> Iterator[Message]:
+    def _picture(self, picture: TranslatedImage, log_ns: int) -> Iterator[Message]:
         record = picture.record
         header: FrameHeader = record.header
         drone, camera = self._drone, header.camera

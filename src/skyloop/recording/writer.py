@@ -23,8 +23,8 @@ from skyloop.messages.frame import H264, Chain
 from skyloop.recording import layout
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.layout import ClockPair, DroneRecord, End, Start
-from skyloop.recording.options import MB, Options, RecorderState, Room, judge_room, numbered
-from skyloop.recording.translation import Message, Picture, Schema, Translator
+from skyloop.recording.options import MB, DiskRoom, Options, RecorderState, judge_room, numbered
+from skyloop.recording.translation import Message, Schema, TranslatedImage, Translator
 
 CHUNK: Final = MB  #: a chunk is closed at this size, or earlier by :meth:`RecordingFile.commit`
 BEAT_S: Final = 0.05  #: interval between polls of the backlog, so that receiving threads need not wake the writer
@@ -59,7 +59,7 @@ def open_target(path: Path, overwrite: bool) -> Target:
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
-class Output:
+class FileOutput:
     """The MCAP writer's stream. Nothing is written to the file until :meth:`flush`, which writes all or nothing."""
 
     def __init__(self, target: Target) -> None:
@@ -116,7 +116,7 @@ class RecordingFile:
         self.written: Counter[str] = Counter()  #: number of messages by topic
         self.count = 0  #: total number of messages
         self._target = opener(path, overwrite)
-        self._output = Output(self._target)
+        self._output = FileOutput(self._target)
         self._writer = Writer(cast(IO[Any], self._output), chunk_size=CHUNK, compression=CompressionType.LZ4)
         self._schemas: dict[type, int] = {}
         self._channels: dict[str, int] = {}
@@ -212,7 +212,7 @@ class FileWriter:
         self.state = RecorderState.STARTING  #: state of the recorder
         self.reason = ""  #: reason why the recorder is paused or has failed
         self.files: list[Path] = []  #: all files, oldest first
-        self.room = Room.ALL  #: which samples to write, depending on the space left on the disk
+        self.room = DiskRoom.ALL  #: which samples to write, depending on the space left on the disk
         self.unwritable = 0  #: number of samples that could not be translated
         self.unwritable_why = ""  #: channel and error of the last sample that could not be written
         #: functions that return the totals of dropped and missed samples, by drone and channel
@@ -250,8 +250,8 @@ class FileWriter:
         folder = self._path.parent
         try:
             free = self._free(folder)
-            self.room = judge_room(free, self._floor, Room.ALL)
-            if self.room is Room.NOTHING:
+            self.room = judge_room(free, self._floor, DiskRoom.ALL)
+            if self.room is DiskRoom.NOTHING:
                 raise UsageError(
                     f"{folder} has {free / MB:.0f} MB left, but recording keeps {self._floor / MB:.0f} MB free: "
                     "choose another folder, or a lower min_free_mb (--min-free-mb)"
@@ -270,7 +270,7 @@ class FileWriter:
     @property
     def shown_reason(self) -> str:
         """The reason why recording is paused, has failed or is leaving out frames."""
-        short = self.state is RecorderState.RECORDING and self.room is Room.NO_FRAMES
+        short = self.state is RecorderState.RECORDING and self.room is DiskRoom.NO_FRAMES
         return "the disk is nearly full: no frames are recorded" if short else self.reason
 
     @property
@@ -372,14 +372,14 @@ class FileWriter:
             return []
 
     def _admits(self, item: Item) -> bool:
-        if item.rank is not Rank.FRAME or (self.room is Room.ALL and self._follows(item)):
+        if item.rank is not Rank.FRAME or (self.room is DiskRoom.ALL and self._follows(item)):
             return True
         self._backlog.count(item)
         return False
 
     def _follows(self, item: Item) -> bool:
         """Return whether a frame can be decoded using this file alone."""
-        if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
+        if not isinstance(item.sample, TranslatedImage) or item.sample.record.format != H264:
             return True
         record = item.sample.record
         chain = self._chains.setdefault((item.drone, item.channel), Chain())
@@ -480,7 +480,7 @@ class FileWriter:
             return
         free = self._free(self.path.parent)
         self._judge_room(free)
-        if self._file is None and self.room is not Room.NOTHING and free >= _REOPEN:
+        if self._file is None and self.room is not DiskRoom.NOTHING and free >= _REOPEN:
             self._open()
 
     def _judge_room(self, free: int) -> None:
@@ -489,11 +489,11 @@ class FileWriter:
         if room is before:
             return
         left = f"{free / MB:.0f} MB left in {self.path.parent}"
-        if room is Room.NOTHING:
+        if room is DiskRoom.NOTHING:
             if self._file is not None:
                 self._close("rotated")
             self._pause(left)
-        elif room is Room.NO_FRAMES:
+        elif room is DiskRoom.NO_FRAMES:
             self._report(f"{left}: frames are no longer recorded", Severity.WARNING)
         else:
             self._report(f"{left}: everything is recorded again", Severity.INFO)
@@ -510,7 +510,7 @@ class FileWriter:
 def _is_key(item: Item) -> bool:
     """Return whether a stream can be decoded starting at this frame."""
     sample = item.sample
-    return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
+    return isinstance(sample, TranslatedImage) and sample.record.format == H264 and sample.record.key
 
 
 def _why(error: OSError) -> str:

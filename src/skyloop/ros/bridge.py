@@ -13,9 +13,9 @@ from skyloop.client.connect import NAME_TIMEOUT_S, dial_by_name
 from skyloop.errors import UsageError
 from skyloop.extend import open_unasked
 from skyloop.messages import Event, Severity
-from skyloop.ros.names import Frames, RosTime, namespaces_of
-from skyloop.ros.pilot import Parameters, Pilot
-from skyloop.ros.telemetry import CameraPublisher, Telemetry
+from skyloop.ros.names import FrameNames, RosTime, namespaces_of
+from skyloop.ros.pilot import Pilot, RosParameters
+from skyloop.ros.telemetry import RosCameraPublisher, RosTelemetry
 from skyloop.vehicles.ros2.node import RosContext, require_rclpy, stay_on_this_machine
 
 PURPOSE: Final = "the bridge to ROS 2"
@@ -67,7 +67,7 @@ class Bridge:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._stack = ExitStack()
-        self._cameras: list[CameraPublisher] = []
+        self._cameras: list[RosCameraPublisher] = []
         self.drones: dict[str, Drone] = {}  #: connected drones by name
         self.namespaces = namespaces_of(settings.drones)  #: namespaces by drone name, without a slash
 
@@ -113,10 +113,10 @@ class Bridge:
         node = context.node("skyloop", namespace, own)
         topics = context.node("skyloop_commands", namespace, own)
         drone.on_event(lambda event: _log(node, event))
-        frames, time = Frames(namespace, settings.map_frame), RosTime(node, drone)
-        Parameters(node, drone)
-        Telemetry(node, drone, time, frames)
-        self._cameras += [CameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
+        frames, time = FrameNames(namespace, settings.map_frame), RosTime(node, drone)
+        RosParameters(node, drone)
+        RosTelemetry(node, drone, time, frames)
+        self._cameras += [RosCameraPublisher(node, drone, each, time, frames) for each in drone.capabilities.cameras]
         pilot = Pilot(topics, node, drone, time, frames, priority=settings.priority, timeout_s=settings.timeout_s)
         self._stack.callback(pilot.close)  # close the pilot before disconnecting, because disconnecting lands the drone
         if settings.priority is not None:

@@ -28,7 +28,7 @@ _FAST_DDS: Final = b"rosidl_typesupport_fastrtps_c"
 
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class FrameNames:
     """Names of a drone's frames. Each one begins with the drone's name, because several drones share one tree."""
 
     drone: str  #: the drone's name, as a valid ROS 2 name

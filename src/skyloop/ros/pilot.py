@@ -11,7 +11,7 @@ from typing import Any, Final
 from skyloop.client import Drone
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.messages import Event, EventKind, Parameter, ParameterType, Value
-from skyloop.ros.names import Frames, RosTime
+from skyloop.ros.names import FrameNames, RosTime
 from skyloop.vehicles.ros2.wire import euler_of, nanoseconds_of
 
 NEAR_M: Final = 0.2  #: tolerance for a goal that specifies none
@@ -33,7 +33,7 @@ class Pilot:
         services: Any,
         drone: Drone,
         time: RosTime,
-        frames: Frames,
+        frames: FrameNames,
         *,
         priority: int | None,
         timeout_s: float,
@@ -212,7 +212,7 @@ def _in_words_of_ros(error: SkyloopError) -> str:
     return error.reason.replace("request_authority()", "the service authority/request")
 
 
-class Parameters:
+class RosParameters:
     """Declares the drone's parameters on a node, writes values set through ROS, and mirrors changes made elsewhere.
 
     ``node``: the rclpy node. Setting a parameter waits for the drone's proxy. ``drone``: the drone, connected as a

@@ -13,7 +13,7 @@ from skyloop.client.channels import Listener
 from skyloop.errors import UnsupportedError, install_command
 from skyloop.messages import CameraInfo, Feedback, LinkState
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.ros.names import Frames, RosTime
+from skyloop.ros.names import FrameNames, RosTime
 from skyloop.vehicles.ros2.node import ros_name
 from skyloop.vehicles.ros2.wire import (
     VARIANCE,
@@ -32,10 +32,10 @@ _NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
 JPEG_QUALITY: Final = 90  #: on OpenCV's scale, 0 to 100
 
 
-class Telemetry:
+class RosTelemetry:
     """Publishes each feedback sample on the topics that have subscribers."""
 
-    def __init__(self, node: Any, drone: Drone, time: RosTime, frames: Frames) -> None:
+    def __init__(self, node: Any, drone: Drone, time: RosTime, frames: FrameNames) -> None:
         from geometry_msgs.msg import TwistStamped
         from nav_msgs.msg import Odometry
         from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -232,10 +232,10 @@ def _or_nan(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-class CameraPublisher:
+class RosCameraPublisher:
     """Publishes the images of one camera while there are subscribers; otherwise frames are not requested."""
 
-    def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: Frames) -> None:
+    def __init__(self, node: Any, drone: Drone, camera: CameraInfo, time: RosTime, frames: FrameNames) -> None:
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import CameraInfo as CameraInfoMessage
         from sensor_msgs.msg import CompressedImage, Image

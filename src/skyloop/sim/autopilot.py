@@ -124,7 +124,7 @@ _STANDING_S = 0.05  # a drone counts as standing for this long after its last co
 _KEPT_OCCURRENCES = 1000  # maximum number of occurrences kept until they are taken
 
 
-class Autopilot:
+class SimAutopilot:
     """Flight states and set-points of all drones. Times are in simulation time."""
 
     def __init__(

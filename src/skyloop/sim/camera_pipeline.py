@@ -50,7 +50,7 @@ class Shutter:
 
 
 @dataclass(eq=False, slots=True)
-class Camera:
+class PipelineCamera:
     """A camera of a drone."""
 
     model: CameraModel
@@ -82,7 +82,7 @@ class Camera:
 class Exposure:
     """A camera's view at a point in time, to be rendered."""
 
-    camera: Camera
+    camera: PipelineCamera
     model: CameraModel
     state: SceneState
     pose: CameraPose
@@ -116,7 +116,7 @@ class Pipeline(ABC):
                 if not exposure.camera.gone:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
 
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
+    def forget(self, cameras: tuple[PipelineCamera, ...]) -> None:
         """Stop delivering frames from these cameras. After this returns, no other thread delivers any of them."""
         with self._delivering:
             for camera in cameras:
@@ -141,7 +141,7 @@ class CameraPipeline(Pipeline):
         self._drones = drones
         self._quality = quality
         self._changed = threading.Condition()
-        self._waiting: dict[Camera, Exposure] = {}  # the camera that has waited longest is first
+        self._waiting: dict[PipelineCamera, Exposure] = {}  # the camera that has waited longest is first
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
 
@@ -219,7 +219,7 @@ def make_renderer(world: World, drones: int, quality: str) -> PlanarRenderer:
 
 
 def expose(
-    camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
+    camera: PipelineCamera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
 ) -> Exposure:
     """Return a camera's exposure for a state. The frame is due after the camera's latency."""
     model, drone = camera.model, camera.drone

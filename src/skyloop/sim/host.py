@@ -19,7 +19,7 @@ from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.camera_pipeline import Camera, Pipeline, Screen
+    from skyloop.sim.camera_pipeline import Pipeline, PipelineCamera, Screen
 
 TICK_S: Final = 0.008  #: time between batches of steps
 
@@ -71,7 +71,7 @@ class SimHost:
         self.stepping = threading.Lock()  #: held while stepping, because a thread that is ending may still be in a step
         self._lock = threading.Lock()
         #: Observers and cameras by drone; always replaced as a whole, never modified.
-        self.observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}
+        self.observers: dict[int, tuple[Observer, tuple[PipelineCamera, ...]]] = {}
         self._stepper: Stepper | None = None
 
     def set_wind(self, wind: Wind) -> None:
@@ -79,7 +79,9 @@ class SimHost:
         self.wind = wind
         self.simulation.set_wind(wind)
 
-    def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
+    def attach(
+        self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]
+    ) -> tuple[PipelineCamera, ...]:
         """Start reporting a drone to an observer and rendering its cameras. The first observer starts the world.
 
         Reports arrive on the thread that steps the world; ``screen`` receives the frames on the rendering thread.
@@ -118,17 +120,15 @@ class SimHost:
     def _make_stepper(self) -> Stepper:
         return _RealTimeStepper(self)
 
-    def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
+    def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[PipelineCamera, ...]:
         if not models:
             return ()
-        from skyloop.sim.camera_pipeline import Camera, Shutter
+        from skyloop.sim.camera_pipeline import PipelineCamera, Shutter
 
         cameras = []
-        for n, model in enumerate(models):
-            place = drone * len(models) + n
+        for place, model in enumerate(models, drone * len(models)):
             offset_s = self.simulation.time_s + place / (self.drones * len(models)) / model.fps
-            seed = self.options.seed * 1000 + place
-            cameras.append(Camera(model, drone, screen, seed, Shutter(offset_s)))
+            cameras.append(PipelineCamera(model, drone, screen, self.options.seed * 1000 + place, Shutter(offset_s)))
         return tuple(cameras)
 
 
@@ -137,7 +137,7 @@ class Stepper(Protocol):
 
     def stop(self) -> None: ...
 
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
+    def forget(self, cameras: tuple[PipelineCamera, ...]) -> None:
         """Stop delivering frames from these cameras, after the current round of reports has ended."""
 
 
@@ -208,7 +208,7 @@ class _RealTimeStepper:
         if self._publisher.pipeline is not None:
             self._publisher.pipeline.stop()
 
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
+    def forget(self, cameras: tuple[PipelineCamera, ...]) -> None:
         if self._thread is not threading.current_thread():
             with self._publishing:  # waits for the current round of reports
                 pass

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import Action, AnyAction, FlightState
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.sim.autopilot import Autopilot, Batteries
+from skyloop.sim.autopilot import Batteries, SimAutopilot
 from skyloop.sim.collisions import Collisions
 from skyloop.sim.control_loops import ControlLoops, Sensors
 from skyloop.sim.dynamics import STEP_S, Bodies, BodyTable, WindField
@@ -94,7 +94,7 @@ class Simulation:
         all_limits = _one_each(limits, drones, "limits")
         loops = ControlLoops(self.parameters, all_limits, self._bodies, LOOP_STEPS * STEP_S)
         self._loops = loops
-        self._autopilot = Autopilot(self.parameters, all_limits, loops, self._sensors, self._batteries)
+        self._autopilot = SimAutopilot(self.parameters, all_limits, loops, self._sensors, self._batteries)
         self._supply()
 
     # Time ------------------------------------------------------------------------------------------------------

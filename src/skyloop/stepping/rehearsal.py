@@ -38,7 +38,7 @@ from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.options import options_of
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera, SteppedCameraPipeline
+    from skyloop.sim.camera_pipeline import PipelineCamera, SteppedCameraPipeline
 
 _BEGIN_NS: Final = 10 * NS_PER_S  #: start of the simulated clock
 _CONNECT_S: Final = 20.0  #: connection timeout
@@ -230,7 +230,7 @@ class _ManualStepper:
             self._pipeline.stop()
         self._host.ended()
 
-    def forget(self, cameras: tuple[Camera, ...]) -> None:
+    def forget(self, cameras: tuple[PipelineCamera, ...]) -> None:
         if self._pipeline is not None:
             self._pipeline.forget(cameras)
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.host.serve import Remove, Status, ask
+from skyloop.host.serve import Remove, StatusRequest, ask
 from skyloop.host.vehicle import VehicleStatus
 from skyloop.messages import EventKind, LinkState
 from tests.integration.processes.firmware import ADDRESS, wait_until_ready
@@ -57,7 +57,7 @@ def vehicles(*names: str, **settings: str) -> str:
 
 
 def rows() -> dict[str, VehicleStatus]:
-    return {row.name: row for row in ask("host", Status()).vehicles}
+    return {row.name: row for row in ask("host", StatusRequest()).vehicles}
 
 
 @pytest.mark.daily

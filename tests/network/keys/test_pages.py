@@ -52,7 +52,7 @@ def test_a_browser_that_trusts_the_authority_trusts_the_page_by_all_its_names(tm
 def test_the_authority_vouches_for_no_other_site(tmp_path: Path) -> None:
     made = page_certificate(tmp_path / "keys" / "pages", OWN, (), NOW)
     key_path = made.authority.with_name("ca.key")
-    authority = certificates.Authority(
+    authority = certificates.CertificateAuthority(
         certificates.read_certificate(made.authority.read_bytes(), made.authority),
         certificates.read_key(key_path.read_bytes(), key_path),
     )

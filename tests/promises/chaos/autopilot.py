@@ -19,7 +19,7 @@ from skyloop.messages import FlightState
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.promises.chaos.journal import Journal
 from tests.promises.chaos.radio import FORCE, Radio
@@ -52,7 +52,7 @@ class JournalledAutopilot:
         self._hear, self._tick = self._autopilot.on_message, self._autopilot.tick
         self._autopilot.on_message = self._on_message  # type: ignore[method-assign]
         self._autopilot.tick = self._on_tick  # type: ignore[method-assign]
-        self._codec = Codec(STATION, 190)
+        self._codec = MavlinkCodec(STATION, 190)
         self._orders: deque[list[str]] = deque()
         self._state, self._armed = "", False
         self._lands_at_m = math.inf
@@ -166,7 +166,7 @@ class JournalledAutopilot:
     def _station(self, command: int, *arguments: float) -> None:
         padded = (*arguments, *[0.0] * (7 - len(arguments)))
         frame = self._codec.encode(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
-        (message,) = Codec(1, 1).decode(frame, whole=True)
+        (message,) = MavlinkCodec(1, 1).decode(frame, whole=True)
         self._hear(self._autopilot.ports[0], message, 0)
 
 

@@ -14,7 +14,7 @@ from typing import Final
 
 import skyloop
 from skyloop.errors import SkyloopError
-from skyloop.host.serve import AddNamed, Remove, Status, ask
+from skyloop.host.serve import AddNamed, Remove, StatusRequest, ask
 from skyloop.host.vehicle import Condition
 from skyloop.messages import Hello, ListParameters, Ping, Request, Role, encode
 from skyloop.network.config import free_port
@@ -151,7 +151,9 @@ def remove_starting(host: str, seed: str) -> None:
         if not early:  # it did not exist yet
             _asked(host, Remove(name))
         rows = [
-            row for row in ask(host, Status()).vehicles if row.name == name and row.condition is not Condition.STOPPED
+            row
+            for row in ask(host, StatusRequest()).vehicles
+            if row.name == name and row.condition is not Condition.STOPPED
         ]
         deadline = time.monotonic() + 5.0
         path = str(find_directory(None, PROXY).socket_path(name))

@@ -18,7 +18,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 WAIT_S = 20.0
@@ -41,7 +41,7 @@ class Scene:
         self.note = note
         self.ours: list[int] = []  #: numbers of the commands with which the proxy steered
         self.set_points = 0
-        self._codec = Codec(STATION, 190)
+        self._codec = MavlinkCodec(STATION, 190)
         self._proxies: list[Proxy] = []
 
     def __enter__(self) -> Scene:
@@ -87,7 +87,7 @@ class Scene:
 
     def station_says(self, said: Message) -> None:
         frame = self._codec.encode(said)
-        (message,) = Codec(1, 1).decode(frame, whole=True)
+        (message,) = MavlinkCodec(1, 1).decode(frame, whole=True)
         running = self.firmware._started
         running._loop.post(partial(running._on_message, running.autopilot.ports[0], message))
 

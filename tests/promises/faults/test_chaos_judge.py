@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, dialect
 from tests.promises.chaos.journal import Entry
 from tests.promises.chaos.judge import Fault, Verdict, faults_of, judge
 from tests.promises.chaos.radio import frames_of, is_stop
@@ -244,7 +244,7 @@ def test_an_emergency_stop_of_a_disarmed_vehicle_is_not_missed(armed: bool) -> N
 
 
 def test_a_stop_is_known_among_frames_that_a_stream_cuts_anywhere() -> None:
-    codec = Codec(255, 190)
+    codec = MavlinkCodec(255, 190)
 
     def command(number: int, *arguments: float) -> bytes:
         padded = (*arguments, *[0.0] * (7 - len(arguments)))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.discovery import FoundProxy
+from skyloop.cockpit.fleet import CockpitFleet
 from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.emulator import Kind
 from tests.promises.faults.scene import KINDS, Scene, taken_off
@@ -23,8 +23,8 @@ class Finder:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
 
-    def __call__(self) -> list[Found]:
-        return [Found("alpha", "memory", self._scene.server.dial)]
+    def __call__(self) -> list[FoundProxy]:
+        return [FoundProxy("alpha", "memory", self._scene.server.dial)]
 
     def add_name(self, name: str) -> None: ...
 
@@ -36,7 +36,7 @@ def test_a_page_flying_to_a_place_yields_to_a_mode_change(kind: Kind, tmp_path: 
     """The page's own hover put it back into GUIDED 0.6 s later, and so did closing the page."""
     with Scene(kind, tmp_path / "alpha.flight") as scene:
         proxy = scene.proxy()
-        with taken_off(scene), cockpit(Fleet(Finder(scene), search_s=0.05)) as client:
+        with taken_off(scene), cockpit(CockpitFleet(Finder(scene), search_s=0.05)) as client:
             with page(client) as pilot, pilot.staying():
                 pilot.take(4)
                 pilot.say("goto", x=80, y=0, z=6)

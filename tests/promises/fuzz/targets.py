@@ -108,10 +108,10 @@ def tello(data: bytes) -> None:
 
 def mavlink(data: bytes) -> None:
     """The data of a MAVLink vehicle: in one datagram, as a stream, and as a stream cut into datagrams."""
-    from skyloop.vehicles.mavlink.wire.codec import Codec
+    from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec
 
-    Codec(1, 1).decode(data, whole=True)
-    stream, cut, signed = Codec(1, 1), Codec(1, 1), Codec(1, 1, key=bytes(32))
+    MavlinkCodec(1, 1).decode(data, whole=True)
+    stream, cut, signed = MavlinkCodec(1, 1), MavlinkCodec(1, 1), MavlinkCodec(1, 1, key=bytes(32))
     for number, part in enumerate(_parts(data)):
         stream.decode(part)
         cut.decode(part, whole=True, source=number % 3)
@@ -124,7 +124,7 @@ def msp(data: bytes) -> None:
     from skyloop.drivers.uri import parse_uri
     from skyloop.vehicles.msp.parameters import options_of
     from skyloop.vehicles.msp.protocol import MspSession
-    from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
+    from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, encode
 
     session = MspSession(options_of(parse_uri("msp:///dev/ttyACM0")), 0)
     now_ns = 0
@@ -133,8 +133,8 @@ def msp(data: bytes) -> None:
         session.poll(now_ns)
         session.receive(part, now_ns)
         if part:  # as a payload with a valid checksum
-            session.receive(encode(Frame(part[0], part[1:], Direction.REPLY)), now_ns)
-            session.receive(encode(Frame(0x2000 | part[0] & 3, part[1:], Direction.REPLY)), now_ns)
+            session.receive(encode(MspFrame(part[0], part[1:], Direction.REPLY)), now_ns)
+            session.receive(encode(MspFrame(0x2000 | part[0] & 3, part[1:], Direction.REPLY)), now_ns)
         session.drain()
 
 

@@ -34,7 +34,7 @@ from skyloop.network.admission import JoinRequest
 from skyloop.network.config import Part
 from skyloop.network.keys.agreement import Agreement
 from skyloop.network.sealing import Seal
-from skyloop.network.session import Session, acquire, release
+from skyloop.network.session import FabricSession, acquire, release
 from skyloop.transport.base import EVENTS, FEEDBACK
 from tests.promises.security.rig import DRONE, Intruder, Rig
 
@@ -145,7 +145,7 @@ def _answered(rig: Rig, _: Intruder) -> bool:
     return any(event.text == "a lie" for event in rig.jane.events)
 
 
-def _as_wendy(rig: Rig, see: Callable[[Session], bool]) -> bool:
+def _as_wendy(rig: Rig, see: Callable[[FabricSession], bool]) -> bool:
     session = acquire(rig.settings("wendy"), Part.APP)
     try:
         return see(session)
@@ -181,7 +181,7 @@ def _let_in(rig: Rig, intruder: Intruder) -> None:
 
 
 def _lets_in(rig: Rig, _: Intruder) -> bool:
-    def joins(session: Session) -> bool:
+    def joins(session: FabricSession) -> bool:
         sender = layout.Sender("join", rig.who("wendy"), layout.new_id())
         request = JoinRequest(session.settings.ring, DRONE, LIAR, sender)
         wish = packets.encode_own(packets.Join(packets.REVISION, LIAR, proof=request.proof))

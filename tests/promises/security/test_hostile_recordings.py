@@ -31,7 +31,7 @@ from skyloop.messages.frame import MAX_PIXELS, MAX_SCANS, image_size, why_not_de
 from skyloop.recording import scan
 from skyloop.recording.layout import Channel
 from skyloop.recording.listing import describe
-from skyloop.recording.pictures import Group, Picture, decode_image
+from skyloop.recording.pictures import FrameGroup, RecordedImage, decode_image
 from skyloop.recording.reader import Recording
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import recover, summarise
@@ -315,7 +315,7 @@ def everything(path: Path, folder: Path) -> None:
     describe(path)
     name = recording.drone().name
     for one in recording.items_and_pictures(name, tuple(Channel)):
-        if isinstance(one, Picture):
+        if isinstance(one, RecordedImage):
             one.pixels()
     summarise(recording)
     for _ in ReplaySource(recording, recording.drone()).samples():
@@ -450,11 +450,11 @@ def test_h264_is_refused_by_the_size_in_its_head(monkeypatch: pytest.MonkeyPatch
     context.options = {"tune": "zerolatency"}
     image = av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), np.uint8), format="bgr24")
     unit = b"".join(bytes(packet) for packet in [*context.encode(image), *context.encode(None)])
-    group = Group()
+    group = FrameGroup()
     group.add(unit)
     assert group.pixels(0, "frame 1").shape == (480, 640, 3)
     monkeypatch.setattr(pyav, "MAX_PIXELS", 640 * 479)
-    group = Group()
+    group = FrameGroup()
     group.add(unit)
     with pytest.raises(FileFormatError, match="can't be decoded"):
         group.pixels(0, "frame 1")

@@ -18,7 +18,7 @@ from skyloop.network import dial as fabric_dial
 from skyloop.network.config import Part, free_port, secured
 from skyloop.network.discovery import runs
 from skyloop.network.keys import Lab, load
-from skyloop.network.session import Session, acquire, release, renewed
+from skyloop.network.session import FabricSession, acquire, release, renewed
 from skyloop.transport.base import FEEDBACK
 from skyloop.transport.testing import ClientLog, wait_until
 from tests.promises.security.deeds import DEEDS, WORKS, comes_true
@@ -206,7 +206,7 @@ def test_a_restarted_router_excludes_revoked_users(lab: Lab, kept: Callable[[str
     keys = load(keys_of(lab, "hub", lab.directory / "router"))
     hub = acquire(secured(FabricSettings(listen=(place,), multicast=False), keys), Part.ROUTER)
 
-    def join(keys: Path, part: Part) -> Session:
+    def join(keys: Path, part: Part) -> FabricSession:
         listen = ("127.0.0.1:0",) if part is Part.PROXY else ()
         return acquire(secured(FabricSettings(connect=(place,), listen=listen, multicast=False), load(keys)), part)
 

@@ -27,7 +27,7 @@ from skyloop.errors import DriverError, SkyloopError
 from skyloop.host.fleet import encode_handed, parse_fleet
 from skyloop.host.host import Host
 from skyloop.host.own_process import OwnProcessVehicle
-from skyloop.host.serve import Add, Status
+from skyloop.host.serve import Add, StatusRequest
 from skyloop.messages import Capabilities, EventKind, GetParameter, LinkState, Role, Severity
 from skyloop.network.packets import Key
 from skyloop.proxy import Proxy
@@ -231,7 +231,7 @@ def test_a_host_shows_addresses_without_secrets_and_serves_with_them() -> None:
     rows = [OwnProcessVehicle(settings, print).row(), *host.status()]
     host.close()
     assert [row.address for row in rows] == ["video://rtsp://127.0.0.1:9/live"] * 2
-    assert SECRET not in f"{settings!r} {rows!r} {Add((settings,))!r} {Status()!r}"
+    assert SECRET not in f"{settings!r} {rows!r} {Add((settings,))!r} {StatusRequest()!r}"
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from skyloop.recording import layout, taps
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.foxglove_server import MAX_HEAD, OriginGuard, ParameterAccess, hidden_host
 from skyloop.recording.layout import FrameRecord
-from skyloop.recording.translation import Picture
+from skyloop.recording.translation import TranslatedImage
 from tests.recording.live.conftest import WAIT_S, Fly
 from tests.recording.live.viewer import Viewer
 from tests.recording.streams import film
@@ -220,7 +220,7 @@ def test_over_a_network_frames_arrive_as_h264_or_else_in_their_own_format(
 def frame_item(seq: int, data: bytes) -> Item:
     header = FrameHeader("front", seq, 1, 2, 32, 24, Encoding.BGR8, 32 * 24 * 3)
     record = FrameRecord(header, 3, "jpeg")
-    return Item(0, "video.front", Rank.FRAME, time.monotonic_ns(), Picture(record, data), len(data))
+    return Item(0, "video.front", Rank.FRAME, time.monotonic_ns(), TranslatedImage(record, data), len(data))
 
 
 def test_only_a_hanging_viewer_loses_messages(fly: Fly, show: Show) -> None:

@@ -39,7 +39,7 @@ from skyloop.recording.layout import FrameRecord
 from skyloop.recording.reader import Recording
 from skyloop.recording.rerun_viewer import RerunLog, RerunViewer, Shown, export_rrd
 from skyloop.recording.taps import View
-from skyloop.recording.translation import Picture
+from skyloop.recording.translation import TranslatedImage
 from tests.recording.live.conftest import Fly
 from tests.recording.streams import film, write_film
 from tests.support import fake_rerun
@@ -220,7 +220,7 @@ def test_a_hanging_viewer_gets_nothing_until_it_continues(
     def show(number: int) -> int:
         unit = film()[number]
         header = FrameHeader("front", number, 1, 2, 64, 48, Encoding.BGR8, 64 * 48 * 3)
-        picture = Picture(FrameRecord(header, 3, H264, unit.key), unit.data)
+        picture = TranslatedImage(FrameRecord(header, 3, H264, unit.key), unit.data)
         viewer.show(Item(0, "video.front", Rank.FRAME, 3, picture, 1000))
         return len(stream.of(CAMERA, "VideoStream")) - 1  # the first is the codec
 

@@ -19,7 +19,7 @@ from skyloop.messages.codec import encode as encode_packet
 from skyloop.vehicles.ardrone.telemetry import (
     OPTION_TAGS,
     ClimbMeter,
-    DroneClock,
+    NavdataClock,
     Reception,
     control_state,
     feedback_of,
@@ -188,13 +188,13 @@ def stamped(stamp_s: float, sequence: int = 1) -> Navdata:
 
 
 def test_without_the_drones_time_the_arrival_is_used() -> None:
-    clock = DroneClock()
+    clock = NavdataClock()
     assert clock.captured_ns(decode(encode(0, 1)), 500) == 500
     assert clock.captured_ns(decode(encode(0, 2)), 400) == 500, "never backwards"
 
 
 def test_the_drones_time_reveals_delays() -> None:
-    clock = DroneClock()
+    clock = NavdataClock()
     base = 1000.0
     for at, delay in enumerate((0.0, 0.004, 0.05, 0.0, 0.02)):
         sent_s = at * 0.005
@@ -203,7 +203,7 @@ def test_the_drones_time_reveals_delays() -> None:
 
 
 def test_the_drones_time_wraps() -> None:
-    clock = DroneClock()
+    clock = NavdataClock()
     for at in range(4):
         arrived_ns = ns(1000.0 + at)
         assert clock.captured_ns(stamped(2046.0 + at), arrived_ns) == pytest.approx(arrived_ns, abs=2000)
@@ -211,7 +211,7 @@ def test_the_drones_time_wraps() -> None:
 
 @given(st.lists(st.tuples(st.floats(0, 5000), st.floats(0, 0.2)), max_size=30))
 def test_times_never_run_backwards_or_ahead(samples: list[tuple[float, float]]) -> None:
-    clock, now_ns, before_ns = DroneClock(), NS_PER_S, 0
+    clock, now_ns, before_ns = NavdataClock(), NS_PER_S, 0
     for stamp_s, step_s in samples:
         now_ns += ns(step_s)
         captured_ns = clock.captured_ns(stamped(stamp_s), now_ns)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.messages import EventKind, Severity
-from skyloop.vehicles.ardrone.telemetry import Health, emergency_reason
+from skyloop.vehicles.ardrone.telemetry import ArdroneHealth, emergency_reason
 from skyloop.vehicles.ardrone.wire.navdata import State
 
 BITS = st.integers(0, 2**32 - 1).map(State)
@@ -28,7 +28,7 @@ EVERY = State(0xFFFFFFFF)
     ],
 )
 def test_an_emergency_and_its_reason(bits: State, reason: str) -> None:
-    health = Health()
+    health = ArdroneHealth()
     health.changes(State.FLYING)
     first = health.changes(State.EMERGENCY | bits)[0]
     assert (first.kind, first.severity, first.data) == (EventKind.EMERGENCY, Severity.ERROR, {"reason": reason})
@@ -37,7 +37,7 @@ def test_an_emergency_and_its_reason(bits: State, reason: str) -> None:
 
 
 def test_the_end_of_an_emergency() -> None:
-    health = Health()
+    health = ArdroneHealth()
     health.changes(State.EMERGENCY)
     (notice,) = health.changes(State(0))
     assert (notice.kind, notice.data) == (EventKind.VEHICLE_MESSAGE, {"reason": "reset"})
@@ -54,7 +54,7 @@ def test_the_end_of_an_emergency() -> None:
     ],
 )
 def test_a_condition_begins_and_ends(bit: State, reason: str) -> None:
-    health = Health()
+    health = ArdroneHealth()
     (begun,) = health.changes(bit)
     assert begun.severity is not Severity.INFO
     assert begun.data == {"reason": reason, "active": True}
@@ -64,14 +64,14 @@ def test_a_condition_begins_and_ends(bit: State, reason: str) -> None:
 
 
 def test_a_healthy_flight_emits_no_events() -> None:
-    health = Health()
+    health = ArdroneHealth()
     for state in (State.BOOTSTRAP, State.DEMO, State.DEMO | State.FLYING, State.COMMUNICATION_WATCHDOG, State(0)):
         assert health.changes(state) == []
 
 
 @given(st.lists(BITS, max_size=10))
 def test_each_change_is_reported_once(states: list[State]) -> None:
-    health = Health()
+    health = ArdroneHealth()
     active: set[object] = set()
     for state in states:
         for notice in health.changes(state):
@@ -83,4 +83,4 @@ def test_each_change_is_reported_once(states: list[State]) -> None:
 
 
 def test_every_bit_may_be_set() -> None:
-    assert len(Health().changes(EVERY)) > 5
+    assert len(ArdroneHealth().changes(EVERY)) > 5

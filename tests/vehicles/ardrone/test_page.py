@@ -7,7 +7,7 @@ import re
 from skyloop.drivers.uri import parse_uri
 from skyloop.vehicles.ardrone.emulator.video import BOTTOM_2_SENT, FRONT_2
 from skyloop.vehicles.ardrone.parameters import PREFIX, Commands, entries_of
-from skyloop.vehicles.ardrone.setpoints import SetpointController
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints
 from skyloop.vehicles.ardrone.telemetry import _REASONS
 from skyloop.vehicles.ardrone.video import cameras_of
 from skyloop.vehicles.ardrone.wire.configuration import format_value, keys_of
@@ -24,7 +24,7 @@ def test_common_parameters() -> None:
     told = {name for row in rows(section("docs/ardrone.md", "### Parameters")) for name in names(row[0])}
     dump = {name: format_value(key.default) for name, key in keys_of(2).items()}
     known = {name for name in entries_of(dump, 2) if not name.startswith(PREFIX)}
-    commands = {p.name for p in Commands(SetpointController(), lambda message, times: None).parameters(2)}
+    commands = {p.name for p in Commands(ArdroneSetpoints(), lambda message, times: None).parameters(2)}
     assert told == known | {name for name in commands if not name.startswith(PREFIX)}
     assert all(f"`{name}`" in DRIVER for name in commands)
 

@@ -13,7 +13,7 @@ from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.proxy.parameters import check
 from skyloop.vehicles.ardrone.parameters import Commands, active_camera, entries_of, is_confirmed, prepare_write
-from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints, Condition
 from skyloop.vehicles.ardrone.wire.at import AtMessage
 from skyloop.vehicles.ardrone.wire.configuration import FLIGHT_ANIMATIONS, LED_ANIMATIONS, format_value, keys_of
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
@@ -166,7 +166,7 @@ class Bench:
     """Commands with a controller, and their messages."""
 
     def __init__(self, condition: Condition | None, version: int | None = 2) -> None:
-        self.setpoints = SetpointController()
+        self.setpoints = ArdroneSetpoints()
         self.setpoints.condition = condition
         self.said: list[tuple[AtMessage, int]] = []
         self.commands = Commands(self.setpoints, lambda message, times: self.said.append((message, times)))

@@ -18,7 +18,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, StickLimits
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints, Condition, StickLimits
 from skyloop.vehicles.ardrone.wire.at import Ref
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, State
 from tests.vehicles.ardrone.scripted import ns
@@ -35,7 +35,7 @@ PERIOD_S = 0.03
 class Cockpit:
     """A pilot with a clock."""
 
-    setpoints: SetpointController = field(default_factory=SetpointController)
+    setpoints: ArdroneSetpoints = field(default_factory=ArdroneSetpoints)
     now_s: float = 1000.0
 
     def __post_init__(self) -> None:

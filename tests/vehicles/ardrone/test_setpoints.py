@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.messages import Attitude
-from skyloop.vehicles.ardrone.setpoints import HEADING_ACCURACY, Stick, StickLimits, limits_of, motion, stick_of
+from skyloop.vehicles.ardrone.setpoints import HEADING_ACCURACY, ArdroneStick, StickLimits, limits_of, motion, stick_of
 from skyloop.vehicles.ardrone.wire.at import Pcmd, format_command
 
 LIMITS = StickLimits(tilt_rad=0.2, climb_m_s=0.7, yaw_rate_rad_s=1.75)
@@ -19,17 +19,17 @@ ANGLES = st.floats(-10.0, 10.0)
 @pytest.mark.parametrize(
     ("asked", "stick"),
     [
-        (Attitude(), Stick(0.0, 0.0, 0.0, 0.0)),
-        (Attitude(roll=0.1), Stick(0.5, 0.0, 0.0, 0.0)),  # to the right
-        (Attitude(pitch=0.1), Stick(0.0, -0.5, 0.0, 0.0)),  # nose down: forward
-        (Attitude(climb=0.35), Stick(0.0, 0.0, 0.5, 0.0)),
-        (Attitude(yaw_rate=0.875), Stick(0.0, 0.0, 0.0, -0.5)),  # counter-clockwise
-        (Attitude(-0.2, -0.2, -0.7, -1.75), Stick(-1.0, 1.0, -1.0, 1.0)),
-        (Attitude(-9.0, 9.0, 9.0, 9.0), Stick(-1.0, -1.0, 1.0, -1.0)),
-        (Attitude(*[math.nan] * 4), Stick(0.0, 0.0, 0.0, 0.0)),  # and not full ones
+        (Attitude(), ArdroneStick(0.0, 0.0, 0.0, 0.0)),
+        (Attitude(roll=0.1), ArdroneStick(0.5, 0.0, 0.0, 0.0)),  # to the right
+        (Attitude(pitch=0.1), ArdroneStick(0.0, -0.5, 0.0, 0.0)),  # nose down: forward
+        (Attitude(climb=0.35), ArdroneStick(0.0, 0.0, 0.5, 0.0)),
+        (Attitude(yaw_rate=0.875), ArdroneStick(0.0, 0.0, 0.0, -0.5)),  # counter-clockwise
+        (Attitude(-0.2, -0.2, -0.7, -1.75), ArdroneStick(-1.0, 1.0, -1.0, 1.0)),
+        (Attitude(-9.0, 9.0, 9.0, 9.0), ArdroneStick(-1.0, -1.0, 1.0, -1.0)),
+        (Attitude(*[math.nan] * 4), ArdroneStick(0.0, 0.0, 0.0, 0.0)),  # and not full ones
     ],
 )
-def test_signs_and_scale(asked: Attitude, stick: Stick) -> None:
+def test_signs_and_scale(asked: Attitude, stick: ArdroneStick) -> None:
     assert stick_of(asked, LIMITS)[0] == stick
 
 
@@ -46,8 +46,8 @@ def test_the_applied_action_matches_the_stick(roll: float, pitch: float, climb: 
         assert got == wanted if abs(wanted) <= limit else abs(got) == limit and got * wanted > 0
 
 
-@pytest.mark.parametrize("stick", [None, Stick(0.0, 0.0, 0.0, 0.0), Stick(0.5, -0.5, 1.0, -1.0)])
-def test_a_motion_can_be_sent(stick: Stick | None) -> None:
+@pytest.mark.parametrize("stick", [None, ArdroneStick(0.0, 0.0, 0.0, 0.0), ArdroneStick(0.5, -0.5, 1.0, -1.0)])
+def test_a_motion_can_be_sent(stick: ArdroneStick | None) -> None:
     name, arguments = motion(stick)
     assert (name, arguments[0]) == ("PCMD", int(Pcmd.HOVER if stick is None else Pcmd.PROGRESSIVE))
     line = format_command(name, 1, *arguments)
@@ -55,7 +55,7 @@ def test_a_motion_can_be_sent(stick: Stick | None) -> None:
 
 
 def test_motion_along_a_heading() -> None:
-    name, arguments = motion(Stick(0.5, -0.5, 0.0, 0.0), math.pi / 2)  # ours is counter-clockwise
+    name, arguments = motion(ArdroneStick(0.5, -0.5, 0.0, 0.0), math.pi / 2)  # ours is counter-clockwise
     assert name == "PCMD_MAG"
     assert arguments == (int(Pcmd.PROGRESSIVE | Pcmd.ABSOLUTE), 0.5, -0.5, 0.0, 0.0, -0.5, HEADING_ACCURACY)
 

@@ -12,7 +12,7 @@ from contextlib import suppress
 import av
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.live_video import Picture, VideoEvent
+from skyloop.drivers.live_video import LiveFrame, VideoEvent
 from skyloop.vehicles.ardrone.video import VideoReceiver
 from skyloop.vehicles.ardrone.wire.pave import PaveFrame, PaveParser
 from tests.support.recordings import recorded
@@ -79,7 +79,7 @@ class Viewer:
     def numbers(self) -> list[int]:
         return [number for number, _, _ in self.seen]
 
-    def show(self, picture: Picture) -> None:
+    def show(self, picture: LiveFrame) -> None:
         with self._news:
             assert picture.pixels.flags.c_contiguous
             self.seen.append((picture.number, picture.captured_ns, digest(picture.pixels.tobytes())))

@@ -10,7 +10,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
 from skyloop.vehicles.mavlink.options import MavlinkOptions, Peer, options_of
 from skyloop.vehicles.mavlink.protocol import TICK_NS, MavlinkSession
-from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, Codec, Landed, Message, px4_custom
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, Landed, MavlinkCodec, Message, px4_custom
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 PEER: Peer = ("127.0.0.1", 14580)
@@ -27,7 +27,7 @@ class Vehicle:
 
     def __init__(self, autopilot: int, system: int = 1, *, version: int = 2) -> None:
         self.autopilot = autopilot
-        self.codec = Codec(system, 1)
+        self.codec = MavlinkCodec(system, 1)
         self.version = version
         self.mode = "STABILIZE" if autopilot == ARDUPILOT else "AUTO.LOITER"
         self.armed = False
@@ -80,10 +80,10 @@ class Bench:
         self.said: list[Message] = []
         self.frames: list[bytes] = []
         self.peers: set[Peer] = set()  # receivers of packets
-        self._ears = Codec(1, 1)
+        self._ears = MavlinkCodec(1, 1)
         self.deliver()
 
-    def hear(self, *messages: Message, peer: Peer = PEER, codec: Codec | None = None) -> None:
+    def hear(self, *messages: Message, peer: Peer = PEER, codec: MavlinkCodec | None = None) -> None:
         for message in messages:
             frame = (codec or self.vehicle.codec).encode(message, version=self.vehicle.version)
             self.session.receive(frame, peer, self.clock(), whole=True)

@@ -32,7 +32,7 @@ from skyloop.vehicles.mavlink.driver import MavlinkDriver
 from skyloop.vehicles.mavlink.emulator import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.vehicles.mavlink.link import MavlinkLink, TcpClient
 from skyloop.vehicles.mavlink.protocol import MavlinkSession
-from skyloop.vehicles.mavlink.wire.codec import Codec, Landed
+from skyloop.vehicles.mavlink.wire.codec import Landed, MavlinkCodec
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.vehicles.mavlink.scripted import ARDUPILOT, Vehicle, options
 
@@ -321,7 +321,7 @@ def test_a_second_program_that_takes_the_vehicle_keeps_it() -> None:
         driver.apply(Velocity(forward=0.3))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             lands = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_DO_SET_MODE, 0, 1, 9, 0, 0, 0, 0, 0)
-            other.sendto(Codec(250, 190).encode(lands), ("127.0.0.1", it.settings.ports.udp))
+            other.sendto(MavlinkCodec(250, 190).encode(lands), ("127.0.0.1", it.settings.ports.udp))
         assert sink.wait(lambda: any("changed to LAND" in event.text for event in sink.events), PATIENCE_S)
         with pytest.raises(DriverError, match="not chosen here"):
             driver.apply(Velocity(forward=0.3))

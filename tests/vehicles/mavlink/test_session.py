@@ -32,7 +32,7 @@ from skyloop.vehicles.mavlink.options import PoseMessage
 from skyloop.vehicles.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession, rank_of
 from skyloop.vehicles.mavlink.setpoints import STEP_NS, Goal
 from skyloop.vehicles.mavlink.telemetry import VehicleState
-from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, Codec, Message, chunks_of
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, MavlinkCodec, Message, chunks_of
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.support.recordings import recorded
 from tests.vehicles.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
@@ -102,7 +102,7 @@ def test_units_axes_and_signs() -> None:
 
 def test_another_vehicle_with_the_same_id_is_reported_and_ignored() -> None:
     bench = Bench(Vehicle(PX4)).found()
-    other = Codec(1, 1)
+    other = MavlinkCodec(1, 1)
     bench.hear(m.MAVLink_attitude_message(20_000, 1.0, 0, 0, 0, 0, 0), peer=("127.0.0.1", 14581), codec=other)
     for _ in range(3):
         bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 14581), codec=other)
@@ -113,7 +113,7 @@ def test_another_vehicle_with_the_same_id_is_reported_and_ignored() -> None:
 
 
 def test_a_vehicle_is_chosen_by_its_system_id_and_by_its_peer() -> None:
-    for text, right in (("sysid=2", Codec(2, 1)), ("peer=127.0.0.1:14581", Codec(1, 1))):
+    for text, right in (("sysid=2", MavlinkCodec(2, 1)), ("peer=127.0.0.1:14581", MavlinkCodec(1, 1))):
         bench = Bench(Vehicle(PX4), options(f"mavlink://udpin:127.0.0.1:14540?parameters=no&{text}"))
         bench.hear(bench.vehicle.heartbeat())
         assert not bench.session.is_receiving
@@ -125,7 +125,7 @@ def test_after_a_loss_no_other_system_is_flown() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.go_on(3.0, silent=True)
     assert bench.link() is LinkState.LOST
-    bench.hear(bench.vehicle.heartbeat(), codec=Codec(9, 1))
+    bench.hear(bench.vehicle.heartbeat(), codec=MavlinkCodec(9, 1))
     assert not bench.session.is_receiving
     bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 20_000))
     assert bench.session.is_receiving, "the same system at another address"
@@ -134,7 +134,7 @@ def test_after_a_loss_no_other_system_is_flown() -> None:
 @pytest.mark.parametrize(("system", "component", "kind", "autopilot"), [(255, 190, 6, 8), (1, 100, 30, 8)])
 def test_ground_stations_and_cameras_are_not_vehicles(system: int, component: int, kind: int, autopilot: int) -> None:
     bench = Bench(Vehicle(PX4))
-    bench.hear(m.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3), codec=Codec(system, component))
+    bench.hear(m.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3), codec=MavlinkCodec(system, component))
     assert not bench.session.is_receiving
     assert bench.texts == []
 
@@ -178,7 +178,7 @@ def test_an_old_vehicle_is_answered_in_its_version_and_offered_the_new_one() -> 
 
 def test_signed_messages_without_a_key_are_clearly_refused() -> None:
     bench = Bench(Vehicle(PX4))
-    signing = Codec(1, 1, key=bytes(32))
+    signing = MavlinkCodec(1, 1, key=bytes(32))
     for _ in range(300):
         bench.clock.advance(0.02)
         bench.hear(bench.vehicle.heartbeat(), codec=signing)
@@ -256,7 +256,7 @@ def test_texts_and_health_become_events() -> None:
 
 def test_an_autopilot_with_another_component_is_named_and_can_be_chosen() -> None:
     vehicle = Vehicle(ARDUPILOT)
-    vehicle.codec = Codec(1, 42)
+    vehicle.codec = MavlinkCodec(1, 42)
     bench = Bench(vehicle)
     for _ in range(3):
         bench.hear(vehicle.heartbeat())

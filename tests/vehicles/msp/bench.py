@@ -18,10 +18,10 @@ from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
-from skyloop.vehicles.msp.emulator import RACER, Board, BoardSettings
+from skyloop.vehicles.msp.emulator import RACER, BoardSettings, EmulatedBoard
 from skyloop.vehicles.msp.parameters import MspOptions, options_of
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
 
 TICK_S: Final = 0.008
 POSE_TICKS: Final = 2
@@ -51,7 +51,7 @@ class Bench:
         world = replace(load_world("empty", 0), targets=())
         self.simulation = Simulation(world, seed=1, parameters=BATTERY_FREE)
         self.clock = ManualClock(100 * NS_PER_S)
-        self.board = Board(SimulatedVehicle(self.simulation, 0), settings or BoardSettings(), self.clock.now_ns)
+        self.board = EmulatedBoard(SimulatedVehicle(self.simulation, 0), settings or BoardSettings(), self.clock.now_ns)
         self.sink = RecordingSink()
         self.poses = poses
         self.cut = self.deaf = False
@@ -61,7 +61,7 @@ class Bench:
         self.noise_m = 0.0
         self._random = random.Random(seed)
         self._behind_s = 0.0
-        self.sent: list[Frame] = []
+        self.sent: list[MspFrame] = []
         self._parser = Parser()
         self._ticks = 0
         self._look()
@@ -118,7 +118,7 @@ class Bench:
             self.sent.append(frame)
             reply = self.board.answer(frame, self.clock.now_ns)
             if frame.function in self.refused:
-                reply = Frame(frame.function, b"", Direction.ERROR)
+                reply = MspFrame(frame.function, b"", Direction.ERROR)
             if reply is not None and not self.deaf and frame.function not in self.unanswered:
                 self.session.receive(encode(reply), self.clock.now_ns)
 

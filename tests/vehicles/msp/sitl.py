@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
-from skyloop.vehicles.msp.wire.frames import Frame, encode
+from skyloop.vehicles.msp.wire.frames import MspFrame, encode
 from skyloop.vehicles.msp.wire.messages import Function
 from skyloop.vehicles.sim.firmware.betaflight import connected, program_path
 from skyloop.vehicles.sim.firmware.keeper import request_real_time
@@ -69,7 +69,7 @@ class Sitl:
                 preexec_fn=request_real_time,  # noqa: PLW1509  the feeder's thread does not run yet
             )
             with suppress(OSError):
-                connected(MSP_PORT, encode(Frame(Function.API_VERSION)), b"$M>").close()
+                connected(MSP_PORT, encode(MspFrame(Function.API_VERSION)), b"$M>").close()
                 return
             self._process.kill()
             self._process.wait()

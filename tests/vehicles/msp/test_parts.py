@@ -14,14 +14,14 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import DriverError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, LinkState, ResetEmergency, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
-from skyloop.vehicles.msp.firmware import Setup, hindrances
+from skyloop.vehicles.msp.firmware import MspSetup, hindrances
 from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import PATIENCE_NS, Motion, MotionEstimate, Questions, Telemetry, charge_left
+from skyloop.vehicles.msp.setpoints import MspReport, MspSetpoints, Phase
+from skyloop.vehicles.msp.telemetry import PATIENCE_NS, MotionEstimate, MspMotion, MspTelemetry, Questions, charge_left
 from skyloop.vehicles.msp.wire import messages as msp
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import Function, Identity, ModeRange
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import Function, ModeRange, MspIdentity
 
 # Addresses -----------------------------------------------------------------------------------------------------------
 
@@ -73,7 +73,7 @@ def test_velocity_from_noisy_poses(rate: int) -> None:
 
 def test_an_old_pose_expires_but_its_heading_does_not() -> None:
     estimate = MotionEstimate()
-    estimate.on_attitude(msp.Attitude(0.0, 0.0, 90.0))  # east by the compass: yaw 0
+    estimate.on_attitude(msp.MspAttitude(0.0, 0.0, 90.0))  # east by the compass: yaw 0
     estimate.on_pose(pose((0.0, 0.0, 1.0), 0, yaw=1.0))
     estimate.on_pose(pose((0.0, 0.0, 1.0), NS_PER_S // 50, yaw=1.0))
     estimate.on_pose(pose((9.0, 9.0, 9.0), 0, yaw=2.0))  # older: ignored
@@ -86,7 +86,7 @@ def test_an_old_pose_expires_but_its_heading_does_not() -> None:
 
 def test_gps() -> None:
     estimate = MotionEstimate()
-    estimate.on_attitude(msp.Attitude(0.0, 0.0, 0.0))
+    estimate.on_attitude(msp.MspAttitude(0.0, 0.0, 0.0))
     estimate.on_gps(msp.Gps(True, 3, 1.0, 1.0, 0.0, 1.0, 0.0), 0)
     assert estimate.at(0).velocity_m_s is None, "three satellites are too few"
     estimate.on_gps(msp.Gps(True, 9, 47.0, 8.0, 400.0, 0.0, 0.0), 0)
@@ -104,11 +104,11 @@ def test_gps() -> None:
 # Settings ------------------------------------------------------------------------------------------------------------
 
 BOXES = ((0, "ARM"), (1, "ANGLE"), (28, "AIR MODE"), (36, "PREARM"), (50, "MSP OVERRIDE"))
-BETAFLIGHT = Identity("BTFL", (4, 6, 0), (1, 47), "SITL")
+BETAFLIGHT = MspIdentity("BTFL", (4, 6, 0), (1, 47), "SITL")
 
 
 def test_wanted_switches_are_on_and_no_others() -> None:
-    setup = Setup(
+    setup = MspSetup(
         BETAFLIGHT,
         BOXES,
         (
@@ -127,8 +127,8 @@ def test_wanted_switches_are_on_and_no_others() -> None:
 
 
 def test_inav_without_a_failsafe_is_refused() -> None:
-    inav = Identity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
-    setup = Setup(
+    inav = MspIdentity("INAV", (8, 0, 0), (2, 5), "MATEKF405")
+    setup = MspSetup(
         inav,
         BOXES,
         (ModeRange(0, 0, 1700, 2100), ModeRange(1, 1, 900, 2100)),
@@ -137,7 +137,7 @@ def test_inav_without_a_failsafe_is_refused() -> None:
     )
     assert "it does nothing" in hindrances(setup.diagnose(override=False))
     assert str(inav) == "INAV 8.0.0 on MATEKF405"
-    unknown = Setup(inav, BOXES, setup.ranges, receiver_is_msp=False)
+    unknown = MspSetup(inav, BOXES, setup.ranges, receiver_is_msp=False)
     told = hindrances(unknown.diagnose(override=False))
     assert "sticks do not arrive by MSP" in told
     assert "failsafe is unknown" in told
@@ -154,7 +154,7 @@ def test_charge() -> None:
 
 
 def test_parameters() -> None:
-    setpoints = SetpointController()
+    setpoints = MspSetpoints()
     parameters = DriverParameters(setpoints)
     parameters.write("limits.tilt", 0.3)
     parameters.write("msp.aux3", 1700)
@@ -184,40 +184,40 @@ def test_a_question_is_asked_three_times() -> None:
     questions.ask(1, answers.append)
     questions.ask(2, answers.append)
     for step in range(3):
-        assert questions.due(step * PATIENCE_NS) == Frame(1)
+        assert questions.due(step * PATIENCE_NS) == MspFrame(1)
         assert questions.due(step * PATIENCE_NS + 1) is None
-    assert questions.due(3 * PATIENCE_NS) == Frame(2)
+    assert questions.due(3 * PATIENCE_NS) == MspFrame(2)
     assert answers == [None]
-    assert not questions.on_frame(Frame(9, b"", Direction.REPLY))
-    assert questions.on_frame(Frame(2, b"", Direction.ERROR))
+    assert not questions.on_frame(MspFrame(9, b"", Direction.REPLY))
+    assert questions.on_frame(MspFrame(2, b"", Direction.ERROR))
     assert answers == [None, None]
     assert questions.idle
 
 
 def test_states_are_requested_singly_or_together() -> None:
-    single = Telemetry({1: 50.0, 2: 50.0, 3: 50.0})
-    assert single.requests(0) == [Frame(1), Frame(2)], "at most two unanswered requests"
+    single = MspTelemetry({1: 50.0, 2: 50.0, 3: 50.0})
+    assert single.requests(0) == [MspFrame(1), MspFrame(2)], "at most two unanswered requests"
     assert single.requests(1) == []
-    assert single.on_frame(Frame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
+    assert single.on_frame(MspFrame(2, b"b", Direction.REPLY)) == [(2, b"b")], "and the previous one is lost"
     assert single.unanswered == 1
-    assert single.requests(2) == [Frame(3)]
-    assert single.on_frame(Frame(3, b"", Direction.ERROR)) == [(3, None)]
+    assert single.requests(2) == [MspFrame(3)]
+    assert single.on_frame(MspFrame(3, b"", Direction.ERROR)) == [(3, None)]
     single.drop(3)
     assert all(frame.function != 3 for frame in single.requests(NS_PER_S))
     single.forget()
-    assert single.on_frame(Frame(1, b"a", Direction.REPLY)) == []
+    assert single.on_frame(MspFrame(1, b"a", Direction.REPLY)) == []
 
 
 def test_after_a_lost_answer_no_other_is_mistaken_for_it() -> None:
-    together = Telemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
-    assert together.requests(0) == [Frame(Function.MULTIPLE, b"\1\2"), Frame(3)]
-    reply = Frame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
+    together = MspTelemetry({1: 50.0, 2: 25.0, 3: 10.0}, (1, 2))
+    assert together.requests(0) == [MspFrame(Function.MULTIPLE, b"\1\2"), MspFrame(3)]
+    reply = MspFrame(Function.MULTIPLE, b"\1a\1b", Direction.REPLY)
     assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
     together.requests(NS_PER_S)
     together.requests(2 * NS_PER_S)  # the answers of a second ago never came
     assert together.unanswered == 2 + 1
     assert together.on_frame(reply) == [(1, b"a"), (2, b"b")]
-    assert together.on_frame(Frame(Function.MULTIPLE, b"", Direction.ERROR)) == []
+    assert together.on_frame(MspFrame(Function.MULTIPLE, b"", Direction.ERROR)) == []
     assert together.due_ns() is not None
 
 
@@ -234,24 +234,24 @@ REPLIES = {
     Function.RX_MAP: bytes((0, 1, 3, 2)),
     Function.FAILSAFE_CONFIG: msp.FailsafeConfig(0.5, 20.0, 1000, 0.0, 1).encode(),
     Function.RC_TUNING: bytes((100, 70, 20, 20, 20, 0, 50, 0, 0, 0, 20)),
-    Function.ATTITUDE: msp.Attitude(1.0, 2.0, 45.0).encode(),
+    Function.ATTITUDE: msp.MspAttitude(1.0, 2.0, 45.0).encode(),
     Function.ALTITUDE: msp.Altitude(0.2, 0.0).encode() + bytes(4),
     Function.INAV_ANALOG: bytes.fromhex("40a0066400000000000000000000000000000000004b"),
 }
 
 
-def inav_reply(frame: Frame, flags: int) -> Frame:
+def inav_reply(frame: MspFrame, flags: int) -> MspFrame:
     status = bytes.fromhex("f401000063000500") + b"\x10" + flags.to_bytes(4, "little") + bytes((3, 0, 0, 0, 0, 0, 0, 0))
     settings = {b"receiver_type\0": b"\2", b"max_angle_inclination_rll\0": (300).to_bytes(2, "little")}
     if frame.function == Function.INAV_STATUS:
-        return Frame(frame.function, status, Direction.REPLY)
+        return MspFrame(frame.function, status, Direction.REPLY)
     if frame.function == Function.COMMON_SETTING:
-        return Frame(frame.function, settings[frame.payload], Direction.REPLY)
+        return MspFrame(frame.function, settings[frame.payload], Direction.REPLY)
     if frame.function == Function.SET_RAW_RC:
-        return Frame(frame.function, b"", Direction.REPLY)
+        return MspFrame(frame.function, b"", Direction.REPLY)
     if frame.function in REPLIES:
-        return Frame(frame.function, REPLIES[Function(frame.function)], Direction.REPLY)
-    return Frame(frame.function, b"", Direction.ERROR)
+        return MspFrame(frame.function, REPLIES[Function(frame.function)], Direction.REPLY)
+    return MspFrame(frame.function, b"", Direction.ERROR)
 
 
 def test_inav_is_identified_and_armed() -> None:
@@ -300,7 +300,7 @@ def test_a_pilot_hands_over_the_sticks_and_takes_them_back() -> None:
     setpoints = given_away()
     assert setpoints.left_to == ""
     assert setpoints.channels(NS_PER_S // 50)[2] == pytest.approx(1420, abs=2), "nothing jumps"
-    setpoints.on_report(Report(armed=True), 2)
+    setpoints.on_report(MspReport(armed=True), 2)
     assert setpoints.left_to == "RECEIVER"
     assert [event.data["active"] for event in setpoints.pop_events()] == [True, False]
     with pytest.raises(DriverError, match="at the pilot's receiver"):
@@ -317,7 +317,7 @@ def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_rese
         nonlocal now_ns
         for _ in range(round(seconds / 0.02)):
             now_ns += NS_PER_S // 50
-            setpoints.on_report(Report(armed=True, overridden=overridden), now_ns)
+            setpoints.on_report(MspReport(armed=True, overridden=overridden), now_ns)
             if not overridden:
                 setpoints.on_pilot_throttle(0.42)
             setpoints.step_stop(now_ns)
@@ -335,36 +335,36 @@ def test_a_pilots_switch_off_and_on_raises_no_throttle_after_a_stop_without_rese
     assert see(overridden=True, seconds=0.02) == pytest.approx(1420, abs=2), "after the reset it is adopted in flight"
 
 
-def given_away() -> SetpointController:
+def given_away() -> MspSetpoints:
     """Return a controller after a pilot flew by receiver at a throttle of 0.42 and handed over the sticks."""
-    setpoints = SetpointController(override=True)
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
-    setpoints.on_report(Report(armed=True), 0)
+    setpoints = MspSetpoints(override=True)
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
+    setpoints.on_report(MspReport(armed=True), 0)
     assert setpoints.left_to == "RECEIVER"
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
     setpoints.on_pilot_throttle(0.42)
-    setpoints.on_report(Report(armed=True, overridden=True), 1)
+    setpoints.on_report(MspReport(armed=True, overridden=True), 1)
     return setpoints
 
 
 @pytest.mark.parametrize("climbs", [False, True])
 def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(climbs: bool) -> None:
     """It tipped over, or a switch killed it: 20 ms later the software take-off armed it again."""
-    setpoints = SetpointController()
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints = MspSetpoints()
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     setpoints.receiving = True
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(0.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
-    setpoints.on_report(Report(armed=False), 0)
+    setpoints.on_report(MspReport(armed=False), 0)
     assert setpoints.ask_takeoff(1) == ""
     setpoints.apply(Attitude(climb=0.5), 1)
-    setpoints.on_report(Report(armed=True), 2)
+    setpoints.on_report(MspReport(armed=True), 2)
     if climbs:
         setpoints.phase = Phase.FLYING
-    setpoints.on_report(Report(armed=False), 3)
+    setpoints.on_report(MspReport(armed=False), 3)
     with pytest.raises(DriverError, match="disarmed"):
         setpoints.apply(Attitude(climb=0.5), 4)
     assert setpoints.phase is Phase.STANDING
@@ -372,8 +372,8 @@ def test_a_vehicle_disarmed_in_its_take_off_is_not_armed_again_by_that_take_off(
 
 def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_landing() -> None:
     """A simulated world ran slower than the firmware's clock: its motors were stopped at 1.6 m, without an event."""
-    setpoints, now_ns = SetpointController(), 0
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints, now_ns = MspSetpoints(), 0
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     setpoints.receiving, setpoints.phase, setpoints.hover = True, Phase.FLYING, 0.4
 
     def descend(climb: float, height: float, time_s: float) -> Phase:
@@ -381,7 +381,7 @@ def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_
         setpoints.apply(Attitude(climb=-0.5), now_ns)
         for _ in range(round(time_s / 0.02)):
             now_ns += 20_000_000
-            setpoints.on_motion(Motion(climb_m_s=climb, height_m=height, precise=True))
+            setpoints.on_motion(MspMotion(climb_m_s=climb, height_m=height, precise=True))
             setpoints.channels(now_ns)
         return setpoints.phase
 
@@ -399,16 +399,16 @@ def test_a_descent_that_seems_to_stall_high_above_the_ground_needs_more_to_be_a_
 
 def test_a_vehicle_found_again_disarmed_can_take_off_at_once() -> None:
     """Its firmware restarted in flight: the earlier take-off is over, and none continues."""
-    setpoints = SetpointController()
-    setpoints.set_up(Setup(BETAFLIGHT, BOXES), "")
+    setpoints = MspSetpoints()
+    setpoints.set_up(MspSetup(BETAFLIGHT, BOXES), "")
     estimate = MotionEstimate()
     estimate.on_altitude(msp.Altitude(1.0, 0.0), 0)
     setpoints.on_motion(estimate.at(0))
-    setpoints.on_report(Report(armed=True), 1)
+    setpoints.on_report(MspReport(armed=True), 1)
     setpoints.phase = Phase.FLYING
     setpoints.lost()
     setpoints.on_motion(estimate.at(2))
-    setpoints.on_report(Report(armed=False), 3)
+    setpoints.on_report(MspReport(armed=False), 3)
     assert setpoints.phase is Phase.STANDING
     assert setpoints.ask_takeoff(4) == ""
 

@@ -19,8 +19,8 @@ from skyloop.messages import Attitude, FlightState, LinkState, Takeoff
 from skyloop.vehicles.msp.driver import MspDriver
 from skyloop.vehicles.msp.emulator import BetaflightFirmware, bit
 from skyloop.vehicles.msp.wire.firmwares import flag_names
-from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import Function, Status, channels, pack_channels
+from skyloop.vehicles.msp.wire.frames import MspFrame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import Function, MspStatus, channels, pack_channels
 from tests.support.betaflight import world
 from tests.vehicles.msp.sitl import MSP_PORT, Sitl
 from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
@@ -67,10 +67,10 @@ class Line:
         self._socket = socket.create_connection((vehicle.host, vehicle.port), 5)
         self._socket.settimeout(5)
         self._parser = Parser()
-        self._came: list[Frame] = []
+        self._came: list[MspFrame] = []
 
     def ask(self, function: int, payload: bytes = b"") -> bytes:
-        self._socket.sendall(encode(Frame(function, payload)))
+        self._socket.sendall(encode(MspFrame(function, payload)))
         while True:
             while not self._came:
                 self._came += self._parser.feed(self._socket.recv(4096))
@@ -83,7 +83,7 @@ class Line:
 
     def state(self) -> tuple[bool, set[str], int]:
         """Return whether it is armed, what prevents arming, and the throttle in force [µs]."""
-        status = Status.of_betaflight(self.ask(Function.STATUS_EX))
+        status = MspStatus.of_betaflight(self.ask(Function.STATUS_EX))
         names = flag_names("BTFL", status.flags or 0, status.count)
         return bool(status.modes & 1), set(names), channels(self.ask(Function.RC))[3]
 

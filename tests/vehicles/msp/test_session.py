@@ -14,10 +14,10 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Idle, LinkState, ResetEmergency
 from skyloop.vehicles.msp.emulator import EMPTY_WRITES, BoardSettings, bit
-from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.setpoints import Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import Motion
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
+from skyloop.vehicles.msp.firmware import MspSetup
+from skyloop.vehicles.msp.setpoints import MspReport, MspSetpoints, Phase
+from skyloop.vehicles.msp.telemetry import MspMotion
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, encode
 from skyloop.vehicles.msp.wire.messages import FailsafeConfig, Function, ModeRange, OnLoss, channels
 from tests.vehicles.msp.bench import TICK_S, Bench, options
 
@@ -108,16 +108,16 @@ NOISES = (0.05, 0.1, 0.2)  # of the climb [m/s]; that of a position of 1 cm is 0
 SEEDS = 20
 
 
-def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[SetpointController, list[float]]:
+def descent(climb: float, noise: float, seed: int, seconds: float) -> tuple[MspSetpoints, list[float]]:
     """Return a vehicle asked to sink at 0.4 m/s, and its throttle as a share of the hover throttle."""
-    setpoints, chance, now_ns, shares = SetpointController(), random.Random(seed), NS_PER_S, []
-    setpoints.on_report(Report(True), now_ns)
+    setpoints, chance, now_ns, shares = MspSetpoints(), random.Random(seed), NS_PER_S, []
+    setpoints.on_report(MspReport(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     setpoints.apply(Attitude(climb=-0.4), now_ns)
     for tick in range(round(seconds / 0.02)):
         now_ns += NS_PER_S // 50
         true = climb if tick > 50 else -0.4
-        setpoints.on_motion(Motion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
+        setpoints.on_motion(MspMotion(climb_m_s=true + chance.gauss(0.0, noise), height_m=0.5, precise=True))
         setpoints.channels(now_ns)
         if setpoints.phase is Phase.STANDING:
             break
@@ -308,7 +308,7 @@ def test_other_firmware_is_not_flown() -> None:
     identity = ((1, b"\0\1\x2a"), (2, b"CLFL"), (3, b"\2\6\0"), (4, b"ABCD"))
     for function, payload in ((101, bytes(20)), *identity, (101, bytes(20))):
         bench.session.poll(now_ns)
-        bench.session.receive(encode(Frame(function, payload, Direction.REPLY)), now_ns)
+        bench.session.receive(encode(MspFrame(function, payload, Direction.REPLY)), now_ns)
     for publish in bench.session.drain():
         publish(bench.sink)
     assert bench.sink.link_state is LinkState.DEGRADED
@@ -648,11 +648,11 @@ def test_no_stop_arms_a_vehicle_with_unknown_state_and_mode_names(silent: Functi
 
 def test_a_stop_cuts_the_throttle_even_if_the_order_of_the_sticks_is_unknown() -> None:
     """The centre of roll may be half throttle; a stop without an arm switch was sent as such."""
-    setpoints = SetpointController()
-    setpoints.on_report(Report(True), 10**9)
+    setpoints = MspSetpoints()
+    setpoints.on_report(MspReport(True), 10**9)
     setpoints.apply(EmergencyStop(), 10**9)
     assert setpoints.channels(10**9)[:4] == [1000] * 4
-    setpoints.set_up(Setup(sticks=(1, 2, 3, 0), sticks_known=True), "")
+    setpoints.set_up(MspSetup(sticks=(1, 2, 3, 0), sticks_known=True), "")
     assert setpoints.channels(10**9)[:4] == [1000, 1500, 1500, 1500]
 
 
@@ -680,15 +680,15 @@ def test_a_stop_while_a_flying_vehicle_is_found_is_not_undone_by_adopting_it() -
 
 def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() -> None:
     """Neither during the stop nor after it has expired: else no pilot would look at it, or land it, any more."""
-    setpoints, now_ns = SetpointController(), 10**9
-    setpoints.on_report(Report(True), now_ns)
+    setpoints, now_ns = MspSetpoints(), 10**9
+    setpoints.on_report(MspReport(True), now_ns)
     setpoints.adopt(0.3, now_ns)
     assert setpoints.flight_state() is FlightState.FLYING
     setpoints.apply(EmergencyStop(), now_ns)
     told = set()
     for _ in range(120):
         now_ns += 10**8
-        setpoints.on_report(Report(True), now_ns)
+        setpoints.on_report(MspReport(True), now_ns)
         setpoints.step_stop(now_ns)
         told.add(setpoints.flight_state())
     assert [event.data["reason"] for event in setpoints.pop_events()] == ["stop_given_up"]
@@ -700,7 +700,7 @@ def test_a_vehicle_that_does_not_disarm_by_a_stop_is_not_reported_as_landed() ->
         assert "still armed" in setpoints.ask_takeoff(now_ns)
         assert setpoints.channels(now_ns)[:4].count(1000) == 1, "no throttle"
         setpoints.lost()
-    setpoints.on_report(Report(False), now_ns)
+    setpoints.on_report(MspReport(False), now_ns)
     assert setpoints.flight_state() is FlightState.LANDED
     setpoints.apply(ResetEmergency(), now_ns)
     assert "still armed" not in setpoints.ask_takeoff(now_ns)
@@ -823,8 +823,8 @@ def test_a_vehicle_that_has_just_started_says_what_it_waits_for() -> None:
 def test_an_empty_write_is_acknowledged_as_by_a_real_one_without_effect(number: int) -> None:
     """A configurator's write was reported as refused. Compared with Betaflight 4.6.0 SITL."""
     bench = Bench()
-    reply = bench.board.answer(Frame(number, b""), bench.clock.now_ns)
-    assert reply == Frame(number, b"", Direction.REPLY)
-    written = bench.board.answer(Frame(number, b"\0"), bench.clock.now_ns)
+    reply = bench.board.answer(MspFrame(number, b""), bench.clock.now_ns)
+    assert reply == MspFrame(number, b"", Direction.REPLY)
+    written = bench.board.answer(MspFrame(number, b"\0"), bench.clock.now_ns)
     assert written is not None
     assert written.direction is Direction.ERROR, "the written value is not kept"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from skyloop.clock import nanoseconds
-from skyloop.vehicles.tello.protocol import MOTION_NS, PATIENCE_NS, TRIES, Conversation, Request
+from skyloop.vehicles.tello.protocol import MOTION_NS, PATIENCE_NS, TRIES, Conversation, TelloRequest
 
 STEP = PATIENCE_NS + 1
 
 
 def asked(conversation: Conversation, text: str) -> list[str | None]:
     replies: list[str | None] = []
-    conversation.ask(Request(text, replies.append))
+    conversation.ask(TelloRequest(text, replies.append))
     return replies
 
 

@@ -8,7 +8,7 @@ from skyloop.clock import nanoseconds
 from skyloop.messages import FlightState
 from skyloop.vehicles.tello.options import VelocityAxes
 from skyloop.vehicles.tello.telemetry import FlightWatch, height_m, velocity_m_s
-from skyloop.vehicles.tello.wire import State
+from skyloop.vehicles.tello.wire import TelloState
 
 PERIOD_S = 0.1
 
@@ -24,7 +24,7 @@ class Film:
         for _ in range(round(seconds / PERIOD_S)):
             self._frames += 1
             self._motor_s = self._frames * PERIOD_S if motors else getattr(self, "_motor_s", 5.0)
-            state = State(distance_cm=tof, height_cm=h, motor_s=int(self._motor_s), speed_dm_s=(0, 0, 0))
+            state = TelloState(distance_cm=tof, height_cm=h, motor_s=int(self._motor_s), speed_dm_s=(0, 0, 0))
             self.watch.update(state, nanoseconds(self._frames * PERIOD_S))
         return self.watch.phase
 
@@ -100,12 +100,12 @@ def test_stopped_motors_end_the_flight() -> None:
     ],
 )
 def test_heights(distance: float | None, height: float | None, metres: float | None) -> None:
-    assert height_m(State(distance_cm=distance, height_cm=height)) == metres
+    assert height_m(TelloState(distance_cm=distance, height_cm=height)) == metres
 
 
 def test_axes_of_the_velocity() -> None:
-    state = State(yaw_deg=90.0, speed_dm_s=(0.0, 5.0, -2.0))  # its nose points to the right of the initial heading
+    state = TelloState(yaw_deg=90.0, speed_dm_s=(0.0, 5.0, -2.0))  # its nose points to the right of the initial heading
     assert velocity_m_s(state, VelocityAxes.START) == pytest.approx((0.5, 0.0, 0.2))
     assert velocity_m_s(state, VelocityAxes.BODY) == pytest.approx((0.0, -0.5, 0.2))
     assert velocity_m_s(state, VelocityAxes.NONE) is None
-    assert velocity_m_s(State(speed_dm_s=(1.0, 0.0, 0.0)), VelocityAxes.START) is None
+    assert velocity_m_s(TelloState(speed_dm_s=(1.0, 0.0, 0.0)), VelocityAxes.START) is None

@@ -45,7 +45,7 @@ _SIGNED: Final = ec.ECDSA(hashes.SHA256())
 
 
 @dataclass(frozen=True, slots=True)
-class Authority:
+class CertificateAuthority:
     """A lab's authority. ``key`` is set only where identities are issued."""
 
     certificate: x509.Certificate
@@ -87,13 +87,13 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
-def make_authority(days: int, now: datetime) -> Authority:
+def make_authority(days: int, now: datetime) -> CertificateAuthority:
     """Create the authority of a new lab. Its name ends in random digits to tell labs apart."""
     return _self_signed(f"Skyloop lab {secrets.token_hex(4)}", days, now)
 
 
 def issue(
-    authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
+    authority: CertificateAuthority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
     """Create a certificate for an identity, signed with the authority's key and valid no longer than that."""
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
@@ -103,7 +103,7 @@ def issue(
     return _issued(authority, identity.name, key, until, now, purposes, [urn])
 
 
-def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Authority:
+def make_page_authority(names: Sequence[str], days: int, now: datetime) -> CertificateAuthority:
     """Create an authority for pages, separate from the lab's. It may certify only these names and names below them.
 
     Its certificates are valid for private addresses, names on local networks, and the names given on creation. A
@@ -115,7 +115,7 @@ def make_page_authority(names: Sequence[str], days: int, now: datetime) -> Autho
 
 
 def issue_page(
-    authority: Authority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
+    authority: CertificateAuthority, names: Sequence[str], key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
     """Create a certificate for a cockpit's page, reached by these IP addresses and host names; see :func:`issue`."""
     reached = [_general_name(each) for each in names]
@@ -128,7 +128,7 @@ def page_names(certificate: x509.Certificate) -> list[str]:
     return [*map(str, found.get_values_for_type(x509.IPAddress)), *found.get_values_for_type(x509.DNSName)]
 
 
-def may_certify(authority: Authority, name: str) -> bool:
+def may_certify(authority: CertificateAuthority, name: str) -> bool:
     """Return whether a page authority may certify an address or a name."""
     permitted = authority.certificate.extensions.get_extension_for_class(x509.NameConstraints).value.permitted_subtrees
     wanted = _general_name(name)
@@ -188,7 +188,7 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
     return key
 
 
-def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
+def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> CertificateAuthority:
     """Check that a certificate belongs to an authority. ``key`` is None on machines that issue no certificates."""
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
@@ -198,7 +198,7 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
         raise FileFormatError(f"{path} is not the certificate of an authority created by Skyloop")
     if key is not None and not matches(key, certificate):
         raise UsageError(f"the key of the authority does not belong to its certificate {path}")
-    return Authority(certificate, key)
+    return CertificateAuthority(certificate, key)
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
@@ -223,7 +223,7 @@ def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
     return key.public_key() == certificate.public_key()
 
 
-def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
+def check_issued(certificate: x509.Certificate, authority: CertificateAuthority, path: Path) -> None:
     try:
         certificate.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature):
@@ -249,16 +249,16 @@ def _general_name(name: str) -> x509.IPAddress | x509.DNSName:
         return x509.DNSName(name.lower())
 
 
-def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> Authority:
+def _self_signed(title: str, days: int, now: datetime, *constraints: x509.ExtensionType) -> CertificateAuthority:
     key, name = new_key(), _name(title)
     builder = _builder(name, name, key, now, now + timedelta(days=days), authority=True)
     for constraint in constraints:
         builder = builder.add_extension(constraint, critical=True)
-    return Authority(builder.sign(key, hashes.SHA256()), key)
+    return CertificateAuthority(builder.sign(key, hashes.SHA256()), key)
 
 
 def _issued(
-    authority: Authority,
+    authority: CertificateAuthority,
     title: str,
     key: PrivateKey,
     until: datetime,

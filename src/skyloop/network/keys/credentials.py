@@ -31,7 +31,7 @@ import msgspec
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.files import expand, read_bytes
 from skyloop.network.keys import certificates
-from skyloop.network.keys.certificates import Authority, Certificate, PrivateKey
+from skyloop.network.keys.certificates import Certificate, CertificateAuthority, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
 from skyloop.platform import is_open_to_others, lock_file
 
@@ -99,14 +99,14 @@ class _File(msgspec.Struct):
     signature: str
 
 
-def encode_roster(roster: Roster, authority: Authority) -> bytes:
+def encode_roster(roster: Roster, authority: CertificateAuthority) -> bytes:
     """Return the content of the roster file, signed."""
     body = msgspec.json.format(msgspec.json.encode(roster), indent=1)
     signature = base64.b64encode(authority.sign(_PURPOSE + body)).decode()
     return msgspec.json.encode(_File(msgspec.Raw(body), signature)) + b"\n"
 
 
-def decode_roster(content: bytes, authority: Authority, path: Path) -> Roster:
+def decode_roster(content: bytes, authority: CertificateAuthority, path: Path) -> Roster:
     """Check the signature of a roster file, then decode it."""
     try:
         file = msgspec.json.decode(content, type=_File)
@@ -131,7 +131,7 @@ class Credentials:
 
     identity: Identity
     expires: datetime
-    authority: Authority
+    authority: CertificateAuthority
     roster: Roster
     directory: Path
     certificate: Certificate = field(repr=False)
@@ -193,7 +193,7 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path, certificate, key)
 
 
-def read_public(directory: Path) -> tuple[Authority, Roster]:
+def read_public(directory: Path) -> tuple[CertificateAuthority, Roster]:
     """Read the public certificate and the roster from a folder of a lab or an identity."""
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
@@ -214,14 +214,14 @@ def expiry_warning(what: str, end: datetime, now: datetime) -> str:
     return f"{what} expires in {rest}, on {day}: issue a new one (skyloop keys issue)"
 
 
-def _read_authority(directory: Path) -> Authority:
+def _read_authority(directory: Path) -> CertificateAuthority:
     path = directory / AUTHORITY_FILE
     return certificates.read_authority(
         certificates.read_certificate(read(path, "the authority's certificate"), path), None, path
     )
 
 
-def _read_roster(directory: Path, authority: Authority) -> Roster:
+def _read_roster(directory: Path, authority: CertificateAuthority) -> Roster:
     path = directory / ROSTER_FILE
     return decode_roster(read(path, "the roster"), authority, path)
 

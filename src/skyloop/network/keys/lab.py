@@ -34,7 +34,7 @@ import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.network.keys import certificates
-from skyloop.network.keys.certificates import Authority
+from skyloop.network.keys.certificates import CertificateAuthority
 from skyloop.network.keys.credentials import (
     AUTHORITY_FILE,
     CERTIFICATE_FILE,
@@ -67,7 +67,7 @@ class Lab:
     Each change holds a lock on the folder, so that a change by another process at the same time is not lost.
     """
 
-    def __init__(self, directory: Path, authority: Authority) -> None:
+    def __init__(self, directory: Path, authority: CertificateAuthority) -> None:
         self.directory = directory
         self.authority = authority
 
@@ -206,7 +206,7 @@ def page_certificate(
     return PageFiles(made.certificate, made.key, made.authority, left_out)
 
 
-def _authority(directory: Path, path: Path, names: Sequence[str], now: datetime) -> Authority:
+def _authority(directory: Path, path: Path, names: Sequence[str], now: datetime) -> CertificateAuthority:
     key_path = directory / "ca.key"
     if key_path.exists():
         key = certificates.read_key(read_private(key_path, "the key of the pages' authority"), key_path)
@@ -222,7 +222,7 @@ def _authority(directory: Path, path: Path, names: Sequence[str], now: datetime)
     return authority
 
 
-def _fits(made: PageFiles, authority: Authority, names: Sequence[str], now: datetime) -> bool:
+def _fits(made: PageFiles, authority: CertificateAuthority, names: Sequence[str], now: datetime) -> bool:
     if not (made.certificate.exists() and made.key.exists()):
         return False
     page = certificates.read_certificate(read(made.certificate, "the page's certificate"), made.certificate)

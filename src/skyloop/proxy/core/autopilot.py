@@ -93,7 +93,7 @@ class ReturnSettings:
     land: bool = True  #: whether to land at the end rather than hover
 
 
-class Mode(Enum):
+class AutopilotMode(Enum):
     """The autopilot's current task."""
 
     OFF = auto()
@@ -105,15 +105,15 @@ class Mode(Enum):
 
 
 _STATES: Final = {
-    Mode.TAKEOFF: FlightState.TAKING_OFF,
-    Mode.HOVER: FlightState.HOVERING,
-    Mode.LAND: FlightState.LANDING,
-    Mode.VELOCITY: FlightState.FLYING,
-    Mode.POSITION: FlightState.FLYING,
+    AutopilotMode.TAKEOFF: FlightState.TAKING_OFF,
+    AutopilotMode.HOVER: FlightState.HOVERING,
+    AutopilotMode.LAND: FlightState.LANDING,
+    AutopilotMode.VELOCITY: FlightState.FLYING,
+    AutopilotMode.POSITION: FlightState.FLYING,
 }
 
 
-class Autopilot:
+class SoftwareAutopilot:
     """Flies one vehicle in software. ``flight`` is informed of the current task and decides when the task has ended."""
 
     def __init__(
@@ -121,7 +121,7 @@ class Autopilot:
     ) -> None:
         self.flight = flight or Flight(native)
         self.settings = settings or AutopilotSettings()
-        self.mode = Mode.OFF
+        self.mode = AutopilotMode.OFF
         self.drifts = False  #: whether the vehicle is held level, but not braked, because its velocity is unknown
         #: Returns the permitted velocity for a desired one, given fresh feedback. Not called during a landing.
         self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
@@ -147,7 +147,7 @@ class Autopilot:
             self._target = action
         if mode is self.mode:
             return
-        if self.mode is Mode.OFF:
+        if self.mode is AutopilotMode.OFF:
             self._integral, self._stepped_ns = (0.0, 0.0), None
         self.mode = mode
         self.flight.steer(_STATES[mode], now_ns)
@@ -156,7 +156,7 @@ class Autopilot:
 
     def stop(self, action_name: str) -> None:
         """Stop steering, because the vehicle itself is now executing an action."""
-        self.mode = Mode.OFF
+        self.mode = AutopilotMode.OFF
         self.flight.let_go(action_name)
 
     def brake(self) -> None:
@@ -168,7 +168,7 @@ class Autopilot:
     def refused(self, reported: FlightState) -> None:
         """Handle the vehicle's refusal of a set-point. If it ``reported`` being landed, a take-off is over."""
         if self.flight.refused(reported):
-            self.mode = Mode.OFF
+            self.mode = AutopilotMode.OFF
 
     def step(
         self, now_ns: int, feedback: Feedback | None, reported: FlightState = FlightState.UNKNOWN
@@ -177,14 +177,14 @@ class Autopilot:
 
         ``reported``: the flight state reported by the driver, which may differ from the state in ``feedback``.
         """
-        if self.mode is Mode.OFF:
+        if self.mode is AutopilotMode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None
         wanted = self._wanted(now_ns, known, reported)
         if self.flight.has_ended(reported, now_ns, known):  # the last set-point stays in force
-            wanted = wanted if self.mode is Mode.LAND else Velocity()
-            self.mode = Mode.OFF
-        elif known is not None and self.mode is not Mode.LAND:
+            wanted = wanted if self.mode is AutopilotMode.LAND else Velocity()
+            self.mode = AutopilotMode.OFF
+        elif known is not None and self.mode is not AutopilotMode.LAND:
             wanted = self.guard(wanted, known, now_ns)
         # Limited, so that one step after a pause does not fill the integral.
         dt = PERIOD_S if self._stepped_ns is None else min(0.1, seconds(now_ns - self._stepped_ns))
@@ -195,11 +195,11 @@ class Autopilot:
         return Attitude(roll, pitch, wanted.up, wanted.yaw_rate)
 
     def _wanted(self, now_ns: int, known: Feedback | None, reported: FlightState) -> Velocity:
-        if self.mode is Mode.TAKEOFF:
+        if self.mode is AutopilotMode.TAKEOFF:
             return self._rise(now_ns, known, self.flight.lifted(reported))
-        if self.mode is Mode.LAND:
+        if self.mode is AutopilotMode.LAND:
             return Velocity(up=-self.settings.descent)
-        if self.mode is Mode.HOVER:
+        if self.mode is AutopilotMode.HOVER:
             return self._hold(known)
         if isinstance(self._target, Position):
             return self._go(self._target, known)
@@ -228,10 +228,10 @@ class Autopilot:
         # A stuck altimeter always reports the same altitude. If the readings change but stay low until time is up, they
         # are correct: the motors turn without lifting the vehicle, as with a real Betaflight on a slow computer.
         if not arrived and len(self._altitudes) > 1 and max(self._altitudes) < settings.takeoff_altitude / 2:
-            self.mode = Mode.LAND
+            self.mode = AutopilotMode.LAND
             self.flight.steer(FlightState.LANDING, now_ns)
             return Velocity(up=-settings.descent)
-        self.mode = Mode.HOVER
+        self.mode = AutopilotMode.HOVER
         self.flight.steer(FlightState.HOVERING, now_ns)
         self._hold_altitude = settings.takeoff_altitude if there else altitude
         return Velocity()
@@ -299,11 +299,11 @@ class Autopilot:
 
 
 _MODES: Final = {
-    Takeoff: Mode.TAKEOFF,
-    Hover: Mode.HOVER,
-    Land: Mode.LAND,
-    Velocity: Mode.VELOCITY,
-    Position: Mode.POSITION,
+    Takeoff: AutopilotMode.TAKEOFF,
+    Hover: AutopilotMode.HOVER,
+    Land: AutopilotMode.LAND,
+    Velocity: AutopilotMode.VELOCITY,
+    Position: AutopilotMode.POSITION,
 }
 
 

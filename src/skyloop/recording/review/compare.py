@@ -32,24 +32,24 @@ What = Literal["asked", "applied"]
 
 
 @dataclass(frozen=True, slots=True)
-class Commands:
+class RecordedCommands:
     """The commands of one recording: actions and their values, with NaN where an action has no value of that name."""
 
     times_s: NDArray[np.float64]
     names: NDArray[np.str_]
     numbers: dict[str, NDArray[np.float64]]
 
-    def at(self, times_s: NDArray[np.float64]) -> Commands:
+    def at(self, times_s: NDArray[np.float64]) -> RecordedCommands:
         """Return the commands in effect at the given times [s]; before the first command, there is none."""
         index = np.searchsorted(self.times_s, times_s, side="right") - 1
         before = index < 0
         index = np.maximum(index, 0)
         if not len(self.times_s):
             empty = np.full(len(times_s), np.nan)
-            return Commands(times_s, np.full(len(times_s), "", "<U16"), dict.fromkeys(self.numbers, empty))
+            return RecordedCommands(times_s, np.full(len(times_s), "", "<U16"), dict.fromkeys(self.numbers, empty))
         names = np.where(before, "", self.names[index])
         numbers = {name: np.where(before, np.nan, column[index]) for name, column in self.numbers.items()}
-        return Commands(times_s, names, numbers)
+        return RecordedCommands(times_s, names, numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +69,8 @@ class Comparison:
     """The commands of two flights on a common time axis, which starts with the older recording."""
 
     aligned: str  #: description of how the times are aligned
-    old: Commands
-    new: Commands
+    old: RecordedCommands
+    new: RecordedCommands
     seconds: float  #: duration of the part that both recordings share
     same_action: float  #: fraction of that duration in which both recordings have the same kind of action
     fields: tuple[FieldDifference, ...]
@@ -142,7 +142,7 @@ def compare(
     )
 
 
-def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset_ns: int) -> Commands:
+def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset_ns: int) -> RecordedCommands:
     """Return a recording's commands; ``offset_ns`` converts its times to those of the old recording."""
     times, names = [], []
     numbers: dict[str, list[float]] = {name: [] for name in ACTION_FIELDS}
@@ -157,7 +157,7 @@ def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset
             value = getattr(action, name, None)
             column.append(np.nan if value is None else float(value))
     order = np.argsort(np.array(times, np.float64), kind="stable")
-    return Commands(
+    return RecordedCommands(
         np.array(times, np.float64)[order],
         np.array(names, "<U16")[order],
         {name: np.array(column, np.float64)[order] for name, column in numbers.items()},
@@ -265,7 +265,7 @@ def _axis(found: Comparison) -> TimeAxis:
     return TimeAxis(float(min(end[0] for end in ends)), float(max(end[1] for end in ends)) + 0.1)
 
 
-def _line(label: str, commands: Commands, name: str, style: str) -> Line:
+def _line(label: str, commands: RecordedCommands, name: str, style: str) -> Line:
     return Line(label, commands.times_s, commands.numbers[name], style, dashed=label == "new", steps=True)
 
 

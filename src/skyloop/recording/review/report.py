@@ -17,7 +17,7 @@ from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.messages import FlightState
 from skyloop.messages.frame import H264
 from skyloop.recording.layout import Channel
-from skyloop.recording.pictures import Picture
+from skyloop.recording.pictures import RecordedImage
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review import charts
 from skyloop.recording.review.charts import Floats, Line, Mark, Page, TimeAxis
@@ -406,7 +406,7 @@ def figures(recording: Recording, drone: str, camera: str, frames: Table, events
     return [figure for figure in shown if figure]
 
 
-def _figure(picture: Picture, t_s: float, why: str) -> str:
+def _figure(picture: RecordedImage, t_s: float, why: str) -> str:
     data, form = thumbnail(picture)
     if not data:
         return ""
@@ -416,7 +416,7 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
     return f'<figure><img src="{source}" alt="frame at {t_s:.1f} s">{caption}</figure>'
 
 
-def thumbnail(picture: Picture) -> tuple[bytes, str]:
+def thumbnail(picture: RecordedImage) -> tuple[bytes, str]:
     """Return a small image and its format.
 
     The image has full size if it can't be scaled here. It is empty if damaged or H.264 that can't be decoded here.

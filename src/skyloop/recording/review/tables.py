@@ -25,7 +25,7 @@ from skyloop.messages import (
     Parameter,
 )
 from skyloop.recording.layout import Channel, Drops, FrameRecord, ResultRecord
-from skyloop.recording.plain import Course
+from skyloop.recording.plain import TimeCourse
 from skyloop.recording.reader import Item, Progress, Recording
 
 #: Column names for the components of feedback's vectors, in order.
@@ -136,14 +136,14 @@ def timed(
     The first sample is determined across all channels, so that tables from several calls have the same start.
     """
     first_ns = begin_ns(recording, drone)
-    course = Course()
+    course = TimeCourse()
     for item in recording.items(drone, channels, progress=progress):
         yield item, max(first_ns, course.follow(item.value, item.entry.log_ns)), first_ns
 
 
 def begin_ns(recording: Recording, drone: str) -> int:
     """Return the time of the first sample that has a time, on the proxy's clock [ns]; 0 if no sample has one."""
-    course = Course()
+    course = TimeCourse()
     for item in recording.items(drone):
         course.follow(item.value)
         if course.first_ns is not None:

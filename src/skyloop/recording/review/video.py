@@ -20,7 +20,7 @@ from skyloop.files import replacing
 from skyloop.messages.frame import MAX_PIXELS
 from skyloop.pyav import require_pyav
 from skyloop.recording.layout import image_topic
-from skyloop.recording.pictures import Picture
+from skyloop.recording.pictures import RecordedImage
 from skyloop.recording.reader import Progress, Recording
 from skyloop.recording.review.tables import begin_ns
 
@@ -114,7 +114,7 @@ def _encoded(
     return Videos((video,), left_out)
 
 
-def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
+def _images(pictures: Iterator[RecordedImage]) -> Iterator[tuple[int, NDArray[np.uint8] | None]]:
     """Decode frames; yield each capture time [ns] with the image, or with None if the frame can't be decoded."""
     for picture in pictures:
         try:
@@ -265,7 +265,7 @@ class StreamCopy:
         self._whole = False  # whether the previous frame was copied
         self._first_ns = 0
 
-    def add(self, picture: Picture) -> None:
+    def add(self, picture: RecordedImage) -> None:
         """Copy a frame or skip it.
 
         Raise ``TooManyChangesError`` if the stream would need more than :data:`MAX_FILES` files, and ``OSError`` if the
@@ -286,7 +286,7 @@ class StreamCopy:
             self.videos.append(Video(file.path, file.frames, begin_s, file.width, file.height, copied=True))
             file.close()
 
-    def _file_for(self, picture: Picture) -> _File | None:
+    def _file_for(self, picture: RecordedImage) -> _File | None:
         """Return the file to write a frame to, or None if the frame can't be decoded."""
         key = picture.record.key
         if not picture.can_be_decoded or not (key or self._whole):
@@ -305,7 +305,7 @@ class StreamCopy:
             self._next(picture, found.parameters, template)
         return self._file
 
-    def _next(self, picture: Picture, parameters: bytes, template: _Template) -> None:
+    def _next(self, picture: RecordedImage, parameters: bytes, template: _Template) -> None:
         self.close()
         number = len(self.videos) + 1
         if number > MAX_FILES:

@@ -261,7 +261,7 @@ def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
     return Ids(**{name: configuration[key] for name, key in _ID_KEYS.items()})
 
 
-class Setup:
+class ArdroneSetup:
     """The steps that set up one drone, with our own ids and the keys ``remembered`` from before a link loss.
 
     Once the steps are done, ``version`` is known, unless the drone does not report it, and ``refused_ids`` is True if

@@ -8,7 +8,7 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.live_camera import intrinsics_of
-from skyloop.drivers.live_video import Picture, VideoEvent
+from skyloop.drivers.live_video import LiveFrame, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError, SkyloopError
@@ -138,7 +138,7 @@ class ArdroneDriver(Driver):
     def _start_video(self, sink: Sink, version: int) -> None:
         options = self.options
 
-        def show(picture: Picture) -> None:
+        def show(picture: LiveFrame) -> None:
             picture.show(sink, self._camera, self._intrinsics(picture.width, picture.height))
 
         def publish_video_event(event: VideoEvent, text: str) -> None:

@@ -13,7 +13,7 @@ import msgspec
 from skyloop.drivers.base import checked_value
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints, Condition
 from skyloop.vehicles.ardrone.wire.at import AtMessage
 from skyloop.vehicles.ardrone.wire.configuration import (
     FIRST_FLIP,
@@ -329,7 +329,7 @@ def _flight_animations(version: int | None) -> Parameter:
 class Commands:
     """The commands that are not actions, presented as parameters with values."""
 
-    def __init__(self, setpoints: SetpointController, send: Send) -> None:
+    def __init__(self, setpoints: ArdroneSetpoints, send: Send) -> None:
         self._setpoints = setpoints
         self._send = send
         self._values: dict[str, Value] = {}

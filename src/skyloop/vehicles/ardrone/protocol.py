@@ -10,13 +10,13 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.messages import AnyAction, EmergencyStop, EventKind, LinkState, Severity, Value
-from skyloop.vehicles.ardrone.configuration import Configurator, Exchange, Ids, Setup
+from skyloop.vehicles.ardrone.configuration import ArdroneSetup, Configurator, Exchange, Ids
 from skyloop.vehicles.ardrone.options import ArdroneOptions
-from skyloop.vehicles.ardrone.setpoints import Condition, SetpointController, limits_of
+from skyloop.vehicles.ardrone.setpoints import ArdroneSetpoints, Condition, limits_of
 from skyloop.vehicles.ardrone.telemetry import (
+    ArdroneHealth,
     ClimbMeter,
-    DroneClock,
-    Health,
+    NavdataClock,
     Reception,
     control_state,
     feedback_of,
@@ -80,7 +80,7 @@ class ArdroneSession(VehicleSession):
         super().__init__(now_ns)
         self.options = options
         self.version = options.version  #: from the address, or None until the drone's configuration has been read
-        self.setpoints = SetpointController()
+        self.setpoints = ArdroneSetpoints()
         self.configurator = Configurator()
         self.reception = Reception()
         self.ready = False  #: whether the drone is set up and its configuration known
@@ -88,9 +88,9 @@ class ArdroneSession(VehicleSession):
         self._ids = ids
         self._extra = extra
         self._sequencer = Sequencer()
-        self._clock = DroneClock()
+        self._clock = NavdataClock()
         self._climb = ClimbMeter()
-        self._health = Health()
+        self._health = ArdroneHealth()
         self._setup_ns: int | None = None
         self._setups_failed = 0
         self._state = self._earlier = State(0)  # state bits in the newest datagram and the previous one
@@ -105,7 +105,7 @@ class ArdroneSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`ArdroneSetpoints.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         self._keep(action, now_ns)
@@ -268,12 +268,12 @@ class ArdroneSession(VehicleSession):
         options = replace(self.options, ids=False) if failed > 1 else self.options
         # A drone that kept our ids ignores commands without them; a drone that lost our ids ignores commands with them.
         self.configurator.ids = self._ids if failed % 2 else None
-        setup = Setup(options, self.configurator, self._ids, self.remembered)
+        setup = ArdroneSetup(options, self.configurator, self._ids, self.remembered)
         done = partial(self._setup_done, setup)
         self.configurator.submit(Exchange(setup.steps(self._state), now_ns + SETUP_NS, done))
         self.due_ns = 0
 
-    def _setup_done(self, setup: Setup, failure: str | None) -> None:
+    def _setup_done(self, setup: ArdroneSetup, failure: str | None) -> None:
         if self._setup_ns is None or self._received_ns is None:
             return  # the link has been lost
         if failure is not None:

@@ -48,7 +48,7 @@ class StickLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Stick:
+class ArdroneStick:
     """The four values of ``PCMD``, each from -1 to 1, with that command's signs."""
 
     roll: float
@@ -68,9 +68,9 @@ def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
     return StickLimits(tilt, climb_mm_s / 1000, yaw)
 
 
-def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
+def stick_of(action: Attitude, limits: StickLimits) -> tuple[ArdroneStick, Attitude]:
     """Return the stick values for an attitude, and the attitude that they command within the drone's limits."""
-    stick = Stick(
+    stick = ArdroneStick(
         roll=_share(action.roll, limits.tilt_rad),
         pitch=_share(-action.pitch, limits.tilt_rad),
         climb=_share(action.climb, limits.climb_m_s),
@@ -85,7 +85,7 @@ def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
     return stick, applied
 
 
-def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
+def motion(stick: ArdroneStick | None, reference_rad: float | None = None) -> AtMessage:
     """Return ``PCMD`` for these stick values; None means hover.
 
     With a reference, return ``PCMD_MAG``, in which forward and right are relative to that heading (0 magnetic north,
@@ -143,7 +143,7 @@ class Condition:
 SILENT_NS: Final = nanoseconds(0.25)
 
 
-class Decision(Enum):
+class ArdroneDecision(Enum):
     """Whether to take off or land."""
 
     STAY = auto()  #: stay in the air if flying, on the ground otherwise
@@ -151,7 +151,7 @@ class Decision(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class ArdroneSetpoints:
     """Stores the last action and turns it into commands, tick by tick.
 
     ``reference_rad`` makes set-points relative to a heading (see :func:`skyloop.vehicles.ardrone.setpoints.motion`).
@@ -162,8 +162,8 @@ class SetpointController:
         self.limits: StickLimits | None = None  #: None until the limits have been read
         self.reference_rad: float | None = None
         self.stop = MotorStop(self._forget_flight)
-        self._decision = Decision.STAY
-        self._stick: Stick | None = None
+        self._decision = ArdroneDecision.STAY
+        self._stick: ArdroneStick | None = None
         self._landing_is_ours = False
         self._decided_ns = 0
         self._rises_until_ns = 0  # time until which a rise may result from a take-off that we sent
@@ -205,7 +205,7 @@ class SetpointController:
         elif self.stop.active:
             return Hover()
         elif isinstance(action, Land):
-            self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, True
+            self._decision, self._stick, self._landing_is_ours = ArdroneDecision.LAND, None, True
         elif isinstance(action, Attitude):
             return self._steer(action)
         elif isinstance(action, Hover):
@@ -215,7 +215,7 @@ class SetpointController:
         return action
 
     def _stop_motors(self, now_ns: int) -> None:
-        self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
+        self._decision, self._stick, self._landing_is_ours = ArdroneDecision.LAND, None, False
         self._releasing = False
         if not self.stop.active:
             self._ask_bit(now_ns)
@@ -223,20 +223,20 @@ class SetpointController:
 
     def _forget_flight(self, given_up: VehicleEvent) -> None:
         self._events.append(given_up)
-        self._decision, self._steering = Decision.STAY, False
+        self._decision, self._steering = ArdroneDecision.STAY, False
 
     def forget_landing(self) -> bool:
         """Cancel a pending landing; return whether there was one."""
-        if not self._landing_is_ours or self._decision is not Decision.LAND:
+        if not self._landing_is_ours or self._decision is not ArdroneDecision.LAND:
             return False
-        self._decision, self._steering = Decision.STAY, False
+        self._decision, self._steering = ArdroneDecision.STAY, False
         return True
 
     def _release_motors(self, now_ns: int) -> None:
         if self.condition is None:
             raise DriverError("no data from the drone: cannot tell whether there is an emergency to reset")
         self.stop.reset()
-        self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
+        self._decision, self._stick, self._landing_is_ours = ArdroneDecision.LAND, None, False
         if self.condition.emergency and not self._releasing:
             self._releasing = True
             self._ask_bit(now_ns)
@@ -246,9 +246,9 @@ class SetpointController:
             raise DriverError("no data from the drone: take-off is refused until the link is up")
         if self.condition.emergency or self.stop.active:
             raise DriverError("the drone is in emergency: reset it first")
-        if self._decision is not Decision.TAKE_OFF:
+        if self._decision is not ArdroneDecision.TAKE_OFF:
             self._decided_ns = now_ns
-        self._decision, self._stick = Decision.TAKE_OFF, None
+        self._decision, self._stick = ArdroneDecision.TAKE_OFF, None
 
     def _steer(self, action: Attitude) -> AnyAction:
         if self.limits is None:
@@ -262,11 +262,11 @@ class SetpointController:
         self._remain(stick)
         return applied
 
-    def _remain(self, stick: Stick | None) -> None:
+    def _remain(self, stick: ArdroneStick | None) -> None:
         if self._landing_is_ours and self.condition is not None and self.condition.touches_down:
-            self._decision, stick = Decision.LAND, None
-        elif self._decision is Decision.LAND:
-            self._decision = Decision.STAY
+            self._decision, stick = ArdroneDecision.LAND, None
+        elif self._decision is ArdroneDecision.LAND:
+            self._decision = ArdroneDecision.STAY
         self._stick = stick
 
     # Receiving ----------------------------------------------------------------------------------------------------
@@ -292,18 +292,18 @@ class SetpointController:
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
         was_landing = self.condition is not None and self.condition.control is ControlState.LANDING
-        broken_off = was_landing and self._steering and self._decision is Decision.STAY
+        broken_off = was_landing and self._steering and self._decision is ArdroneDecision.STAY
         if broken_off and condition.control not in _LANDING_ON:
             self._landing_is_ours = False  # the drone may start the next landing itself
         self.condition, self._received_ns = condition, now_ns
         self._releasing &= condition.emergency
         stands = not (condition.flying or condition.emergency)
-        if stands and self._decision is not Decision.TAKE_OFF and now_ns >= self._rises_until_ns:
+        if stands and self._decision is not ArdroneDecision.TAKE_OFF and now_ns >= self._rises_until_ns:
             self._steering = False
         if condition.emergency:
-            self._decision, self._stick = Decision.LAND, None
-        elif self._decision is Decision.TAKE_OFF and condition.flying:
-            self._decision, self._landing_is_ours = Decision.STAY, False
+            self._decision, self._stick = ArdroneDecision.LAND, None
+        elif self._decision is ArdroneDecision.TAKE_OFF and condition.flying:
+            self._decision, self._landing_is_ours = ArdroneDecision.STAY, False
         elif not condition.flying and condition.control is not ControlState.LANDING:
             self._landing_is_ours = False
 
@@ -312,8 +312,8 @@ class SetpointController:
         self.condition = self._stick = None
         self._warned_blind = False
         self._releasing = False
-        if self._decision is Decision.TAKE_OFF:
-            self._decision = Decision.STAY
+        if self._decision is ArdroneDecision.TAKE_OFF:
+            self._decision = ArdroneDecision.STAY
 
     # Sending ---------------------------------------------------------------------------------------------------
 
@@ -362,14 +362,14 @@ class SetpointController:
         return Ref.EMERGENCY if self._bit else Ref(0)
 
     def _flight_bits(self, now_ns: int) -> Ref | None:
-        if self._decision is Decision.TAKE_OFF:
+        if self._decision is ArdroneDecision.TAKE_OFF:
             if now_ns - self._decided_ns < TAKEOFF_PATIENCE_NS:
                 self._rises_until_ns = now_ns + RISES_NS
                 return Ref.TAKEOFF
-            self._decision = Decision.STAY
+            self._decision = ArdroneDecision.STAY
             text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"
             self._events.append(message(text, "no_takeoff", Severity.WARNING))
-        if self._decision is Decision.LAND:
+        if self._decision is ArdroneDecision.LAND:
             return Ref(0)
         if self.condition is None:
             return None  # leave the drone as it is

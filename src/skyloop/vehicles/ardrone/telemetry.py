@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from skyloop.clock import LiveClock, nanoseconds, seconds
-from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent, message
+from skyloop.drivers.vehicle_session import PacketOrder, RestartWatch, VehicleEvent, message
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
@@ -86,7 +86,7 @@ class Reception:
             return False
         if now_ns - self._accepted_ns >= RESTART_SILENCE_NS:
             self._watch.forget()
-        if self._watch.update(sequence, now_ns) is Arrival.LATE:
+        if self._watch.update(sequence, now_ns) is PacketOrder.LATE:
             return False
         if sequence < self._sequence:
             self.counts["restarts"] += 1
@@ -96,7 +96,7 @@ class Reception:
         return True
 
 
-class DroneClock:
+class NavdataClock:
     """Determines the capture time of a datagram's state on this host's clock.
 
     This is the stamp in the option ``time``, taking the smallest recent delay as zero, or without that option the
@@ -289,7 +289,7 @@ def emergency_reason(state: State) -> str:
     return ",".join(name for bit, name in _REASONS if state & bit) or "unknown"
 
 
-class Health:
+class ArdroneHealth:
     """Reports each change in the drone's health bits once."""
 
     def __init__(self) -> None:

@@ -21,7 +21,7 @@ from skyloop.clock import Clock, LiveClock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.h264 import Unit
 from skyloop.drivers.live_camera import intrinsics_of
-from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveVideo, Picture, Stream, StreamRelay, VideoEvent
+from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveFrame, LiveVideo, Stream, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
@@ -367,7 +367,7 @@ class VideoReceiver(LiveVideo):
         port: int,
         *,
         version: int,
-        show: Callable[[Picture], None],
+        show: Callable[[LiveFrame], None],
         on_event: Callable[[VideoEvent, str], None],
         wants: Callable[[], bool] = lambda: True,
         came: Callable[[Coded], None] | None = None,

@@ -19,10 +19,10 @@ from skyloop.vehicles.mavlink.telemetry import (
     PREARM,
     SLOW_S,
     STANDARD_GRAVITY,
-    Telemetry,
+    MavlinkTelemetry,
     VehicleState,
 )
-from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
+from skyloop.vehicles.mavlink.wire.codec import COPTER_NUMBERS, PX4_NUMBERS, Landed, MavAutopilot, copter_mode, px4_mode
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 CLIMB_GAIN_PER_S: Final = 2.0  #: acceleration per unit of climb rate error
@@ -142,7 +142,7 @@ class AutopilotProfile(ABC):
         """Return whether a take-off is complete; ``rose``: whether the vehicle has been airborne since accepting it."""
 
     @abstractmethod
-    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+    def ready(self, telemetry: MavlinkTelemetry, now_ns: int) -> bool | None:
         """Return whether the vehicle can be armed; None if it does not report that."""
 
     @abstractmethod
@@ -198,7 +198,7 @@ class ArduCopterProfile(AutopilotProfile):
         """Return whether the altitude has been reached, which is the only sign that a take-off is complete."""
         return rose and vehicle.altitude_m is not None and vehicle.altitude_m >= height_m - REACHED_M
 
-    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+    def ready(self, telemetry: MavlinkTelemetry, now_ns: int) -> bool | None:
         """Return whether the pre-arm checks pass and the estimator has a position."""
         good = telemetry.prearm_good(now_ns)
         ekf = telemetry.newest("EKF_STATUS_REPORT", now_ns, SLOW_S)
@@ -286,7 +286,7 @@ class Px4Profile(AutopilotProfile):
         """Return whether the vehicle holds its position, as it does once its take-off mode has ended."""
         return rose and vehicle.mode == self.HOLD and vehicle.landed is not Landed.TAKING_OFF
 
-    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+    def ready(self, telemetry: MavlinkTelemetry, now_ns: int) -> bool | None:
         """Return whether the vehicle can be armed; None while it does not report that.
 
         PX4 never sets this check's *present* bit, and reports the outcome for the current mode. If that mode does not
@@ -336,8 +336,8 @@ def copter_speed(values: Values, which: str, usual_m_s: float) -> float:
 
 def profile_of(autopilot: int) -> AutopilotProfile | None:
     """Return the profile for a heartbeat's ``MAV_AUTOPILOT``; None for an unknown one."""
-    if autopilot == Autopilot.ARDUPILOT:
+    if autopilot == MavAutopilot.ARDUPILOT:
         return ArduCopterProfile()
-    if autopilot == Autopilot.PX4:
+    if autopilot == MavAutopilot.PX4:
         return Px4Profile()
     return None

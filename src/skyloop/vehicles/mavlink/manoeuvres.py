@@ -9,7 +9,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.messages import Attitude, Position, Velocity
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, ThrustModel
-from skyloop.vehicles.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
+from skyloop.vehicles.mavlink.microservices import ACCEPTED, MavlinkCommandSender, VehicleCommand, result_name
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.axes import Vector, flip, swap, to_wire, yaw_between
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message
@@ -243,7 +243,7 @@ class TakeoffSequence:
         """Whether the vehicle is armed for this take-off and no further requests are needed."""
         return self._armed_ns is not None and (self.rose or not self._disarms)
 
-    def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
+    def step(self, vehicle: VehicleState, commands: MavlinkCommandSender, now_ns: int) -> list[Message]:
         """Request what is missing and return the set-points that are due."""
         self._observe(vehicle, commands, now_ns)
         if self.done or self.given_up or self.taken_over or self._other_ns is not None:
@@ -265,7 +265,7 @@ class TakeoffSequence:
             commands.request(self._autopilot.mode_command(self._autopilot.ARMING), now_ns)
         return []
 
-    def _observe(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> None:
+    def _observe(self, vehicle: VehicleState, commands: MavlinkCommandSender, now_ns: int) -> None:
         """Update the take-off's progress from the vehicle's state."""
         answer = None if self._arming_ns is None else commands.result(ARM.number, self._arming_ns)
         if self._armed_ns is None:
@@ -307,7 +307,7 @@ class TakeoffSequence:
         if height > self._best_m + 0.05:
             self._best_m, self._best_ns = height, now_ns
 
-    def _landing_is_over(self, commands: CommandSender, now_ns: int) -> bool:
+    def _landing_is_over(self, commands: MavlinkCommandSender, now_ns: int) -> bool:
         """Return whether our last landing can no longer disarm the vehicle, so a later disarming has another cause."""
         accepted = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns) == ACCEPTED
         return (accepted and not self._autopilot.TAKING_OFF) or now_ns - self._begun_ns > LANDED_NS

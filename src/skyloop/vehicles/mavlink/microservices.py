@@ -10,14 +10,14 @@ from typing import Final
 
 from skyloop.clock import LiveClock, nanoseconds, seconds
 from skyloop.drivers.base import ExternalPose
-from skyloop.drivers.vehicle_session import Arrival, RestartWatch, VehicleEvent
+from skyloop.drivers.vehicle_session import PacketOrder, RestartWatch, VehicleEvent
 from skyloop.drivers.vehicle_session import message as event_of
 from skyloop.messages import Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.options import Peer, PoseMessage
-from skyloop.vehicles.mavlink.telemetry import Telemetry
+from skyloop.vehicles.mavlink.telemetry import MavlinkTelemetry
 from skyloop.vehicles.mavlink.wire.axes import angles_of, swap, to_wire, yaw_between
-from skyloop.vehicles.mavlink.wire.codec import Autopilot, Message
+from skyloop.vehicles.mavlink.wire.codec import MavAutopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 MOVED_NS: Final = nanoseconds(0.3)  #: time without data after which the vehicle may have moved to another port
@@ -128,7 +128,7 @@ def _is_vehicle(heartbeat: Message) -> bool:
 
 def unsupported_reason(heartbeat: Message) -> str:
     """Return why Skyloop can't fly this vehicle; empty if it can."""
-    if heartbeat.autopilot not in tuple(Autopilot):
+    if heartbeat.autopilot not in tuple(MavAutopilot):
         return f"its MAV_AUTOPILOT is {heartbeat.autopilot}; only ArduCopter and PX4 are supported"
     if heartbeat.type not in _MULTIROTORS:
         return f"its MAV_TYPE is {heartbeat.type}, not a multirotor or helicopter"
@@ -154,7 +154,7 @@ def result_name(result: int) -> str:
     return _RESULTS[result] if 0 <= result < len(_RESULTS) else f"result {result}"
 
 
-class CommandSender:
+class MavlinkCommandSender:
     """Sends commands and stores their results.
 
     Level-triggered: to achieve an effect, a caller keeps calling :meth:`request` until the effect is visible.
@@ -215,7 +215,7 @@ class MessageIntervals:
         self._asked: dict[str, tuple[int, int, int]] = {}  # start of counting, count at that time, number of requests
         self._check_ns = 0
 
-    def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
+    def request_missing(self, telemetry: MavlinkTelemetry, commands: MavlinkCommandSender, now_ns: int) -> None:
         """Request up to :data:`AT_ONCE` messages that are missing or too slow."""
         if now_ns < self._check_ns:
             return
@@ -281,7 +281,7 @@ class VehicleClock:
             self.round_trip_s = seconds(best_ns)
         return []
 
-    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> Arrival:
+    def on_stamp(self, kind: str, boot_ms: int, now_ns: int) -> PacketOrder:
         """Classify a message by its stamp as new, older than others of its kind, or sent after a reboot."""
         return self._watches.setdefault(kind, RestartWatch(BEHIND_MS, _WRAP)).update(boot_ms, now_ns)
 

@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.byte_stream import Rank
 from skyloop.drivers.vehicle_session import (
-    Arrival,
     LinkTimeouts,
     LinkTrouble,
     MotorStop,
+    PacketOrder,
     VehicleEvent,
     VehicleSession,
     serial_trouble,
@@ -24,7 +24,7 @@ from skyloop.messages import AnyAction, EmergencyStop, EventKind, FlightState, I
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.vehicles.mavlink.autopilots import AutopilotProfile, profile_of
 from skyloop.vehicles.mavlink.microservices import (
-    CommandSender,
+    MavlinkCommandSender,
     MessageIntervals,
     VehicleClock,
     VehicleCommand,
@@ -34,10 +34,10 @@ from skyloop.vehicles.mavlink.microservices import (
 )
 from skyloop.vehicles.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
 from skyloop.vehicles.mavlink.parameters import ParameterExchange
-from skyloop.vehicles.mavlink.setpoints import CUT, SetpointController
-from skyloop.vehicles.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.vehicles.mavlink.setpoints import CUT, MavlinkSetpoints
+from skyloop.vehicles.mavlink.telemetry import HealthMonitor, MavlinkTelemetry, VehicleState, feedback_of
 from skyloop.vehicles.mavlink.wire.axes import ORIGIN, ORIGIN_HZ, WorldAxes
-from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import BYTEWISE, MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 TICK_NS: Final = nanoseconds(0.02)  #: poll interval while set-points or parameters are due
@@ -100,13 +100,13 @@ class MavlinkSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
-        self.telemetry = Telemetry()
+        self.codec = MavlinkCodec(options.own_system, OWN_COMPONENT, key=options.key)
+        self.telemetry = MavlinkTelemetry()
         self.parameters = ParameterExchange()
-        self.commands = CommandSender((options.system or 1, options.component))
+        self.commands = MavlinkCommandSender((options.system or 1, options.component))
         self.clock = VehicleClock()
         self.autopilot: AutopilotProfile | None = None  #: None if unknown or not recognised yet
-        self.setpoints: SetpointController | None = None  #: None until the autopilot is known, or if it can't be flown
+        self.setpoints: MavlinkSetpoints | None = None  #: None until the autopilot is known, or if it can't be flown
         self.version: Message | None = None  #: the vehicle's AUTOPILOT_VERSION
         self.limits = options.limits  #: the driver's own limits
         self.dropped = 0  #: number of packets that the connection dropped
@@ -153,7 +153,7 @@ class MavlinkSession(VehicleSession):
     # From the driver ---------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`. Raises an error if the vehicle can't be flown."""
+        """Accept an action; see :meth:`MavlinkSetpoints.apply`. Raises an error if the vehicle can't be flown."""
         if isinstance(action, EmergencyStop) and self._kind is None:  # a flying vehicle may be found at any moment
             self._stop.press(now_ns)
             self.due_ns = now_ns
@@ -242,11 +242,11 @@ class MavlinkSession(VehicleSession):
             return
         if kind in _STAMPED:
             arrival = self.clock.on_stamp(kind, message.time_boot_ms, now_ns)
-            if arrival is Arrival.RESTARTED:
+            if arrival is PacketOrder.RESTARTED:
                 self.version = None  # a different vehicle with other parameters may be answering
-                self.telemetry = Telemetry()
+                self.telemetry = MavlinkTelemetry()
                 self._lose("the vehicle rebooted", now_ns)
-            if arrival is not Arrival.NEW:
+            if arrival is not PacketOrder.NEW:
                 return
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)
@@ -477,7 +477,7 @@ class MavlinkSession(VehicleSession):
             text = f"another vehicle answers as system {heartbeat.get_srcSystem()}: setting it up"
             self._publish_event(event_of(text, "another", Severity.WARNING, system=heartbeat.get_srcSystem()))
         self._kind = heartbeat.autopilot, heartbeat.type
-        self.telemetry, self.parameters, self._health = Telemetry(), ParameterExchange(), HealthMonitor()
+        self.telemetry, self.parameters, self._health = MavlinkTelemetry(), ParameterExchange(), HealthMonitor()
         self.parameters.target = self.commands.target
         self.version = self._known_as = self.setpoints = None
         self._axes.forget()
@@ -491,7 +491,7 @@ class MavlinkSession(VehicleSession):
         self.parameters.bytewise = found.BYTEWISE
         if not self._unsupported_reason:
             height_m = takeoff_height(self.limits)
-            self.setpoints = SetpointController(
+            self.setpoints = MavlinkSetpoints(
                 found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values), self._stop
             )
             self._publish_event(event_of(limits_text(self.limits), "limits"))

@@ -42,7 +42,7 @@ from skyloop.vehicles.mavlink.manoeuvres import (
     VelocitySetpoint,
     velocity_message,
 )
-from skyloop.vehicles.mavlink.microservices import CommandSender, VehicleCommand
+from skyloop.vehicles.mavlink.microservices import MavlinkCommandSender, VehicleCommand
 from skyloop.vehicles.mavlink.ownership import FlightOwnership
 from skyloop.vehicles.mavlink.telemetry import VehicleState
 from skyloop.vehicles.mavlink.wire.codec import Landed, Message
@@ -68,7 +68,7 @@ class Goal(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class MavlinkSetpoints:
     """Stores the last action and sends the messages it requires, tick by tick. Not thread-safe.
 
     ``make_thrust`` creates the thrust model for an attitude-controlled flight; ``stop`` may be active already.
@@ -77,7 +77,7 @@ class SetpointController:
     def __init__(
         self,
         autopilot: AutopilotProfile,
-        commands: CommandSender,
+        commands: MavlinkCommandSender,
         takeoff_m: float,
         make_thrust: Callable[[], ThrustModel],
         stop: MotorStop | None = None,

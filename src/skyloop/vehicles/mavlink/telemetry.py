@@ -62,7 +62,7 @@ class VehicleState:
         return self.status in (SystemState.CRITICAL, SystemState.EMERGENCY, SystemState.TERMINATION)
 
 
-class Telemetry:
+class MavlinkTelemetry:
     """Stores the newest message of each kind, with its age."""
 
     def __init__(self) -> None:
@@ -260,7 +260,7 @@ _OTHERS: Final = (3, 4)  #: MAV_BATTERY_FUNCTION of avionics and payload batteri
 
 
 def feedback_of(
-    telemetry: Telemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
+    telemetry: MavlinkTelemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
 ) -> Feedback:
     """Return the vehicle's state in our units and axes. Values that are outdated or not finite are None."""
     attitude = telemetry.attitude(now_ns)
@@ -297,13 +297,13 @@ def _velocity(world: Vector | None, yaw: float | None) -> Vector | None:
     return (*turned(east, north, -yaw), up)
 
 
-def _rates(telemetry: Telemetry, now_ns: int) -> Vector | None:
+def _rates(telemetry: MavlinkTelemetry, now_ns: int) -> Vector | None:
     message = telemetry.newest("ATTITUDE", now_ns, FLOWING_S)
     found = None if message is None else finite(message.rollspeed, message.pitchspeed, message.yawspeed)
     return None if found is None else flip(*found)
 
 
-def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
+def _force(telemetry: MavlinkTelemetry, now_ns: int) -> Vector | None:
     """Return the specific force [m/s²]; PX4 reports m/s², ArduPilot thousandths of g."""
     message = telemetry.newest("HIGHRES_IMU", now_ns, FLOWING_S)
     if message is not None:
@@ -316,7 +316,7 @@ def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
     return flip(message.xacc * unit, message.yacc * unit, message.zacc * unit)
 
 
-def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
+def _charge(telemetry: MavlinkTelemetry, now_ns: int) -> float | None:
     status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
     # Always use the lowest-numbered battery, even if it stops reporting, because batteries differ in charge.
     batteries = telemetry.instances("BATTERY_STATUS", now_ns)
@@ -329,14 +329,14 @@ def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
     return None
 
 
-def _volts(telemetry: Telemetry, now_ns: int) -> float | None:
+def _volts(telemetry: MavlinkTelemetry, now_ns: int) -> float | None:
     message = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
     if message is None or message.voltage_battery in (0, _UNKNOWN_16):
         return None
     return float(message.voltage_battery) / 1000.0
 
 
-def _native(telemetry: Telemetry, now_ns: int) -> dict[str, Value]:
+def _native(telemetry: MavlinkTelemetry, now_ns: int) -> dict[str, Value]:
     native: dict[str, Value] = telemetry.ages(now_ns)
     gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
     if gps is not None:
@@ -400,7 +400,7 @@ class HealthMonitor:
             events.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, weight, data))
         return events
 
-    def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[VehicleEvent]:
+    def update(self, telemetry: MavlinkTelemetry, vehicle: VehicleState | None, now_ns: int) -> list[VehicleEvent]:
         """Return the changes since the last call."""
         ready = None if vehicle is None else vehicle.ready
         if ready:

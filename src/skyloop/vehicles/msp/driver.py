@@ -19,7 +19,7 @@ from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Takeof
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.msp.parameters import DriverParameters, options_of
 from skyloop.vehicles.msp.protocol import MspSession
-from skyloop.vehicles.msp.setpoints import SetpointController
+from skyloop.vehicles.msp.setpoints import MspSetpoints
 from skyloop.vehicles.msp.wire.frames import whole_frames
 
 ACTIONS: Final = frozenset({"idle", "attitude", "emergency_stop", "reset_emergency"})
@@ -35,7 +35,7 @@ class MspDriver(Driver):
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
         self.options = options_of(uri)
-        self._setpoints = SetpointController(self.options.override)
+        self._setpoints = MspSetpoints(self.options.override)
         self._link: MspLink | None = None
 
     def capabilities(self) -> Capabilities:
@@ -48,7 +48,7 @@ class MspDriver(Driver):
             except ImportError as error:
                 raise MissingExtraError(f"{self.uri}", EXTRA, cause=str(error)) from error
         # A fresh controller, which keeps only the settings and learnt values of the previous one.
-        before, fresh = self._setpoints, SetpointController(self.options.override)
+        before, fresh = self._setpoints, MspSetpoints(self.options.override)
         fresh.limits, fresh.gains, fresh.given_aux = before.limits, before.gains, before.given_aux
         fresh.hover, fresh.full_tilt_rad = before.hover, before.full_tilt_rad
         self._setpoints = fresh

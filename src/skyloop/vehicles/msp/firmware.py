@@ -28,7 +28,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     rate_curve,
     share_of,
 )
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, Identity, ModeRange
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, USUAL_MAP, Function, ModeRange, MspIdentity
 
 SUPPORTED: Final = (BETAFLIGHT, INAV)
 LEAST_AUX: Final = 4  #: number of AUX channels that are always sent in addition to the sticks
@@ -46,10 +46,10 @@ _DOCS: Final = 'see docs/msp.md, "What to set"'
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class MspSetup:
     """A flight controller's settings; a setting that was not reported is None."""
 
-    identity: Identity = field(default_factory=Identity)
+    identity: MspIdentity = field(default_factory=MspIdentity)
     boxes: tuple[tuple[int, str], ...] = ()  #: permanent number and name of each mode, in the order of the status bits
     ranges: tuple[ModeRange, ...] = ()
     sticks: tuple[int, ...] = USUAL_MAP  #: positions of roll, pitch, yaw and throttle
@@ -257,17 +257,17 @@ _INAV_TUNING: Final = 11  # number of bytes in INAV's RC_TUNING up to the expo f
 _MSP_RECEIVER: Final = 2  # value of INAV's receiver_type
 
 
-Read = Callable[[Setup, bytes], dict[str, Any]]  #: returns the settings that a reply changes, or raises DecodeError
+Read = Callable[[MspSetup, bytes], dict[str, Any]]  #: returns the settings that a reply changes, or raises DecodeError
 
 
 class Identification:
-    """Requests everything that :class:`Setup` contains, then calls ``done``.
+    """Requests everything that :class:`MspSetup` contains, then calls ``done``.
 
     The setup's variant is empty if the flight controller did not identify itself.
     """
 
-    def __init__(self, questions: Questions, done: Callable[[Setup], None]) -> None:
-        self.setup = Setup()
+    def __init__(self, questions: Questions, done: Callable[[MspSetup], None]) -> None:
+        self.setup = MspSetup()
         self.missing: list[str] = []  #: unreadable settings that are needed before any sticks can be sent
         self._questions = questions
         self._done = done
@@ -321,15 +321,15 @@ class Identification:
         self._done(self.setup)
 
 
-def _identity(setup: Setup, **known: Any) -> dict[str, Any]:
+def _identity(setup: MspSetup, **known: Any) -> dict[str, Any]:
     return {"identity": replace(setup.identity, **known)}
 
 
-def _box_names(setup: Setup, payload: bytes) -> dict[str, Any]:
+def _box_names(setup: MspSetup, payload: bytes) -> dict[str, Any]:
     return {"boxes": tuple(zip((number for number, _ in setup.boxes), msp.box_names(payload), strict=False))}
 
 
-def _tuning(setup: Setup, payload: bytes) -> dict[str, Any]:
+def _tuning(setup: MspSetup, payload: bytes) -> dict[str, Any]:
     if setup.identity.variant == BETAFLIGHT:
         return {"rates": betaflight_rates(payload)}
     if len(payload) < _INAV_TUNING:

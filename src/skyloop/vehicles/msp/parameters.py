@@ -15,7 +15,7 @@ from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Parameter, ParameterType, Value
 from skyloop.vehicles.msp.firmware import MOST_AUX
-from skyloop.vehicles.msp.setpoints import Gains, Limits, SetpointController
+from skyloop.vehicles.msp.setpoints import Gains, Limits, MspSetpoints
 
 DEFAULT_BAUD: Final = 115_200  #: the firmwares' own default for MSP
 DEFAULT_RATE_HZ: Final = 50.0  #: default rate of stick frames
@@ -84,7 +84,7 @@ _Entry = tuple[Parameter, Callable[[float], None]]  # a parameter with its curre
 class DriverParameters:
     """The driver's own parameters. The caller must hold the lock of the controller that uses them."""
 
-    def __init__(self, setpoints: SetpointController) -> None:
+    def __init__(self, setpoints: MspSetpoints) -> None:
         self._setpoints = setpoints
 
     def parameters(self) -> list[Parameter]:

@@ -21,13 +21,13 @@ from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, LinkState, Severity, Value
 from skyloop.messages.feedback import WAKING_UP
 from skyloop.messages.parameter import Diagnostic
-from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, Setup, hindrances
+from skyloop.vehicles.msp.firmware import SUPPORTED, Identification, MspSetup, hindrances
 from skyloop.vehicles.msp.parameters import MspOptions
-from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, Phase, Report, SetpointController
-from skyloop.vehicles.msp.telemetry import MotionEstimate, Questions, Reported, Telemetry, feedback_of
+from skyloop.vehicles.msp.setpoints import PASSING, SETTLING, MspReport, MspSetpoints, Phase
+from skyloop.vehicles.msp.telemetry import MotionEstimate, MspTelemetry, Questions, Reported, feedback_of
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import ARM, ARMED_OF_INAV, MSP_OVERRIDE, explained, flag_names
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, INAV, Function, Sensor
 
 DEGRADED_NS: Final = nanoseconds(0.4)  #: time without data after which the link counts as degraded
@@ -46,7 +46,7 @@ _MODES_AT: Final = 6  # offset of the modes in STATUS
 WAKING_NS: Final = nanoseconds(8.0)  #: longest time after being found for which a flight controller is starting up
 AGAIN_NS: Final = nanoseconds(1.0)  #: time between attempts to identify the flight controller
 
-# Rates at which states are requested. Replies limit them: see :class:`Telemetry`.
+# Rates at which states are requested. Replies limit them: see :class:`MspTelemetry`.
 ATTITUDE_HZ: Final = 50.0
 ALTITUDE_HZ: Final = 25.0
 STATUS_HZ: Final = 20.0
@@ -60,12 +60,12 @@ class MspSession(VehicleSession):
 
     TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
 
-    def __init__(self, options: MspOptions, now_ns: int, setpoints: SetpointController | None = None) -> None:
+    def __init__(self, options: MspOptions, now_ns: int, setpoints: MspSetpoints | None = None) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.setpoints = setpoints or SetpointController(options.override)
+        self.setpoints = setpoints or MspSetpoints(options.override)
         self.motion = MotionEstimate()
-        self.setup: Setup | None = None  #: None until the setup has been read
+        self.setup: MspSetup | None = None  #: None until the setup has been read
         self.reported = Reported()
         self.sticks_hz: float | None = None  #: rate of acknowledged stick frames
         self.unknown = 0  #: number of frames that do not answer any request
@@ -73,11 +73,11 @@ class MspSession(VehicleSession):
         self._parser = Parser()
         self._questions = Questions()
         self._identification: Identification | None = None
-        self._telemetry: Telemetry | None = None
+        self._telemetry: MspTelemetry | None = None
         self._known = False  # whether identification has been completed since the flight controller was found
         self._refused_variant = ""
         self._unread = ""  # settings that were not reported
-        self._part = Setup()  # the settings read so far, which suffice for a stop
+        self._part = MspSetup()  # the settings read so far, which suffice for a stop
         self._armed: bool | None = None  # the state reported before the settings were read; None if not reported
         self._stop_waits = False  # whether a stop is waiting for the armed state to be known
         self._asked_ns: int | None = None
@@ -96,7 +96,7 @@ class MspSession(VehicleSession):
     # From the driver -----------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
-        """Accept an action; see :meth:`SetpointController.apply`."""
+        """Accept an action; see :meth:`MspSetpoints.apply`."""
         self.setpoints.on_motion(self.motion.at(now_ns))
         applied = self.setpoints.apply(action, now_ns)
         self.due_ns = min(self.due_ns, now_ns if isinstance(action, EmergencyStop) else self._sticks_due_ns)
@@ -152,7 +152,7 @@ class MspSession(VehicleSession):
             if frame.direction is not Direction.REQUEST:
                 self._on_frame(frame, now_ns)
 
-    def _on_frame(self, frame: Frame, now_ns: int) -> None:
+    def _on_frame(self, frame: MspFrame, now_ns: int) -> None:
         begins, self._received_ns = self._received_ns is None, now_ns
         self._unreachable = ""
         if begins:
@@ -179,7 +179,7 @@ class MspSession(VehicleSession):
     def _on_state(self, function: int, payload: bytes, now_ns: int) -> None:
         reported = self.reported
         if function == Function.ATTITUDE:
-            reported.attitude = msp.Attitude.decode(payload)
+            reported.attitude = msp.MspAttitude.decode(payload)
             self.motion.on_attitude(reported.attitude)
             self._publish(now_ns)
         elif function == Function.ALTITUDE:
@@ -187,9 +187,9 @@ class MspSession(VehicleSession):
             if reported.status is None or _has_height(reported.status):
                 self.motion.on_altitude(reported.altitude, now_ns)
         elif function in (Function.STATUS_EX, Function.STATUS):
-            self._on_status(msp.Status.of_betaflight(payload), now_ns)
+            self._on_status(msp.MspStatus.of_betaflight(payload), now_ns)
         elif function == Function.INAV_STATUS:
-            self._on_status(msp.Status.of_inav(payload), now_ns)
+            self._on_status(msp.MspStatus.of_inav(payload), now_ns)
         elif function == Function.RAW_GPS:
             self.motion.on_gps(msp.Gps.decode(payload), now_ns)
         elif function == Function.BATTERY_STATE:
@@ -199,7 +199,7 @@ class MspSession(VehicleSession):
         elif function == Function.RC:
             self._on_pilot(msp.channels(payload), now_ns)
 
-    def _on_status(self, status: msp.Status, now_ns: int) -> None:
+    def _on_status(self, status: msp.MspStatus, now_ns: int) -> None:
         assert self.setup is not None
         self.reported.status = status
         variant = self.setup.identity.variant
@@ -212,9 +212,9 @@ class MspSession(VehicleSession):
                 return  # nothing may be sent to a flying vehicle until its throttle is known
             self._may_steer = True
             if armed and self._armed_throttle is not None and not self.options.override:
-                self.setpoints.report = Report(armed, names, overridden)
+                self.setpoints.report = MspReport(armed, names, overridden)
                 self.setpoints.adopt(self._armed_throttle, now_ns)
-        self.setpoints.on_report(Report(armed, names, overridden), now_ns)
+        self.setpoints.on_report(MspReport(armed, names, overridden), now_ns)
         self.motion.stands(does=not armed)
 
     def _on_pilot(self, widths: list[int], now_ns: int) -> None:
@@ -358,11 +358,11 @@ class MspSession(VehicleSession):
         if active and not setpoints.stop.active and not setpoints.receiving:
             # Adopt a vehicle that turns out to be flying again instead of disarming it because of an old stop.
             self._may_steer, self._armed_throttle = False, None
-            setpoints.report = Report()
+            setpoints.report = MspReport()
         return urgent
 
     def _stick_frame(self, now_ns: int) -> bytes:
-        return encode(Frame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
+        return encode(MspFrame(Function.SET_RAW_RC, msp.pack_channels(self.setpoints.channels(now_ns))))
 
     def _count(self, now_ns: int) -> None:
         """Measure the rate of acknowledged stick frames."""
@@ -403,7 +403,7 @@ class MspSession(VehicleSession):
             self._publish_event(message(text, "firmware", Severity.ERROR))
             self._set_link_state(LinkState.DEGRADED, text)
 
-    def _on_setup(self, setup: Setup) -> None:
+    def _on_setup(self, setup: MspSetup) -> None:
         assert self._identification is not None
         if self._identification.missing:  # without them, the throttle or arm switch would be a guess, so ask again
             missing = ", ".join(self._identification.missing)
@@ -434,7 +434,7 @@ class MspSession(VehicleSession):
         }
         bundles = betaflight and setup.identity.api >= BUNDLING_API
         bundle = (Function.ATTITUDE, Function.ALTITUDE, Function.STATUS_EX) if bundles else ()
-        self._telemetry = Telemetry(streams, bundle)
+        self._telemetry = MspTelemetry(streams, bundle)
 
     def _keep_part(self) -> None:
         """Keep the settings read so far or in an earlier attempt, so that at least a stop is possible."""
@@ -487,11 +487,11 @@ class MspSession(VehicleSession):
         return super()._trouble(error)
 
 
-def _known_settings(setup: Setup) -> tuple[bool, bool]:
+def _known_settings(setup: MspSetup) -> tuple[bool, bool]:
     return bool(setup.arm_ranges), setup.sticks_known
 
 
-def _has_height(status: msp.Status) -> bool:
+def _has_height(status: msp.MspStatus) -> bool:
     return any(status.has(sensor) for sensor in (Sensor.BAROMETER, Sensor.GPS, Sensor.RANGEFINDER))
 
 

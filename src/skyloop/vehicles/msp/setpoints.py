@@ -17,8 +17,8 @@ from skyloop.drivers.vehicle_session import MotorStop, VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Idle, ResetEmergency, Severity
 from skyloop.messages.geometry import clamped
-from skyloop.vehicles.msp.firmware import Setup
-from skyloop.vehicles.msp.telemetry import Motion
+from skyloop.vehicles.msp.firmware import MspSetup
+from skyloop.vehicles.msp.telemetry import MspMotion
 from skyloop.vehicles.msp.wire.firmwares import ARM_SWITCH, Curve, explained, stick_for
 
 GRAVITY_M_S2: Final = 9.80665
@@ -95,7 +95,7 @@ class Phase(Enum):
 
 
 @dataclass(slots=True)
-class Report:
+class MspReport:
     """The flight controller's latest report."""
 
     armed: bool | None = None  #: None if unknown
@@ -103,7 +103,7 @@ class Report:
     overridden: bool = False  #: whether the pilot's switch is letting our sticks through
 
 
-class SetpointController:
+class MspSetpoints:
     """Stores the last set-point and turns it into receiver channels.
 
     With ``override``, a pilot keeps a real receiver, and nobody else can arm the vehicle.
@@ -115,19 +115,19 @@ class SetpointController:
         self.given_aux: dict[int, int] = {}
         self.full_tilt_rad: float | None = None  #: tilt at full stick [rad], if set by the user
         self.hover: float | None = None  #: hover throttle, 0 to 1; None until it has been learnt
-        self.report = Report()
+        self.report = MspReport()
         self.phase = Phase.STANDING
         self.stop = MotorStop(lambda event: self._events.append(event))
         self.throttle = 0.0
         self.receiving = False
         self._cut = False  # whether the motors were stopped without confirmation, so the vehicle may still be flying
         self._override = override
-        self._setup = Setup()
+        self._setup = MspSetup()
         self._tilt: tuple[Curve, Curve] = self._setup.tilt_curves()
         self._turn: Curve = self._setup.yaw_curve()
         self._hindrance = "its settings have not been read"  # why the vehicle must not be armed
         self._wanted = LEVEL
-        self._motion = Motion()
+        self._motion = MspMotion()
         self._since_ns = 0  # start of the phase
         self._stepped_ns: int | None = None  # when the channels were last computed
         self._switched = False  # whether the arm switch is on, while arming
@@ -142,7 +142,7 @@ class SetpointController:
         self._asked_ns: int | None = None  # when the pending take-off was requested
         self._events: list[VehicleEvent] = []
 
-    def set_up(self, setup: Setup, hindrance: str) -> None:
+    def set_up(self, setup: MspSetup, hindrance: str) -> None:
         """Store the flight controller's setup, and the reason why the vehicle must not be armed."""
         self._setup, self._hindrance = setup, hindrance
         self._tilt, self._turn = setup.tilt_curves(), setup.yaw_curve()
@@ -260,7 +260,7 @@ class SetpointController:
 
     # Reports -------------------------------------------------------------------------------------------------------
 
-    def on_report(self, report: Report, now_ns: int) -> None:
+    def on_report(self, report: MspReport, now_ns: int) -> None:
         before, self.report, heard = self.report, report, self.receiving
         self.receiving = True
         self._cut = self._cut and report.armed is not False
@@ -299,13 +299,13 @@ class SetpointController:
         if throttle > IDLE and climb is not None and abs(climb) < 0.3:
             self.hover = max(LEAST_LEARNT, min(MOST_LEARNT, throttle))
 
-    def on_motion(self, motion: Motion) -> None:
+    def on_motion(self, motion: MspMotion) -> None:
         self._motion = motion
 
     def lost(self) -> None:
         """Level the sticks, because nothing is being received any more."""
         self.receiving = False
-        self._motion = Motion()
+        self._motion = MspMotion()
         self._wanted = LEVEL
         if self.phase is Phase.ARMING:
             self.phase = Phase.STANDING

@@ -17,15 +17,15 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.messages import Feedback, FlightState, Value
 from skyloop.messages.feedback import EarthOrigin
 from skyloop.messages.geometry import wrap_angle
-from skyloop.vehicles.msp.wire.frames import Direction, Frame
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame
 from skyloop.vehicles.msp.wire.messages import (
     Altitude,
-    Attitude,
     Battery,
     CellVoltages,
     Function,
     Gps,
-    Status,
+    MspAttitude,
+    MspStatus,
     multiple,
 )
 
@@ -40,7 +40,7 @@ class Questions:
     """Asks one question at a time, and repeats it until it is answered, at most :data:`TRIES` times in total."""
 
     def __init__(self) -> None:
-        self._queue: deque[tuple[Frame, Handler]] = deque()
+        self._queue: deque[tuple[MspFrame, Handler]] = deque()
         self._sent_ns: int | None = None
         self._tries = 0
 
@@ -49,13 +49,13 @@ class Questions:
         return not self._queue
 
     def ask(self, function: int, handler: Handler, payload: bytes = b"") -> None:
-        self._queue.append((Frame(function, payload), handler))
+        self._queue.append((MspFrame(function, payload), handler))
 
     def clear(self) -> None:
         self._queue.clear()
         self._sent_ns = None
 
-    def due(self, now_ns: int) -> Frame | None:
+    def due(self, now_ns: int) -> MspFrame | None:
         """Return the request to send now."""
         if not self._queue or (self._sent_ns is not None and now_ns - self._sent_ns < PATIENCE_NS):
             return None
@@ -66,7 +66,7 @@ class Questions:
         self._tries += 1
         return self._queue[0][0]
 
-    def on_frame(self, frame: Frame) -> bool:
+    def on_frame(self, frame: MspFrame) -> bool:
         """Handle a frame; return whether the frame is the reply to the current question."""
         if not self._queue or self._sent_ns is None or frame.function != self._queue[0][0].function:
             return False
@@ -88,13 +88,13 @@ class Stream:
     due_ns: int = 0
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> MspFrame:
         if len(self.functions) > 1:
-            return Frame(Function.MULTIPLE, bytes(self.functions))
-        return Frame(self.functions[0])
+            return MspFrame(Function.MULTIPLE, bytes(self.functions))
+        return MspFrame(self.functions[0])
 
 
-class Telemetry:
+class MspTelemetry:
     """Requests states at their rates in hertz, a few at a time.
 
     A flight controller answers a few dozen requests per second, however fast the line is. Further requests would wait
@@ -127,12 +127,12 @@ class Telemetry:
         """Return when the next request is due; None if no request will ever be due."""
         return min((stream.due_ns for stream in self._streams), default=None)
 
-    def requests(self, now_ns: int) -> list[Frame]:
+    def requests(self, now_ns: int) -> list[MspFrame]:
         """Return the requests to send now, the most overdue first."""
         while self._asked and now_ns - self._asked[0][1] >= PATIENCE_NS:
             self._asked.popleft()
             self.unanswered += 1
-        made: list[Frame] = []
+        made: list[MspFrame] = []
         for stream in sorted(self._streams, key=lambda each: each.due_ns):
             if stream.due_ns > now_ns or len(self._asked) >= self._most:
                 break
@@ -142,7 +142,7 @@ class Telemetry:
             made.append(frame)
         return made
 
-    def on_frame(self, frame: Frame) -> list[tuple[int, bytes | None]]:
+    def on_frame(self, frame: MspFrame) -> list[tuple[int, bytes | None]]:
         """Handle a frame; return the states that it contains, using None for any that the firmware does not support."""
         for number, (function, _) in enumerate(self._asked):
             if frame.function != function:
@@ -195,7 +195,7 @@ class VelocityFilter:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MspMotion:
     """The present motion, with None for unknown values. World axes are east, north, up."""
 
     climb_m_s: float | None = None
@@ -236,7 +236,7 @@ class MotionEstimate:
             if self._heading_rad is not None:
                 self._turned_rad = wrap_angle(_yaw(pose) - self._heading_rad)
 
-    def on_attitude(self, attitude: Attitude) -> None:
+    def on_attitude(self, attitude: MspAttitude) -> None:
         self._heading_rad = wrap_angle(math.pi / 2 - math.radians(attitude.heading_deg))
 
     def on_altitude(self, altitude: Altitude, now_ns: int) -> None:
@@ -266,14 +266,14 @@ class MotionEstimate:
         before_m = self._ground.get(source, height_m)
         self._ground[source] = before_m + (height_m - before_m) / self._stood
 
-    def at(self, now_ns: int) -> Motion:
+    def at(self, now_ns: int) -> MspMotion:
         yaw = self._heading_rad
         if yaw is not None and self._turned_rad is not None:
             yaw = wrap_angle(yaw + self._turned_rad)
         pose = self._pose
         velocity = self._filter.velocity
         if pose is not None and velocity is not None and now_ns - pose.captured_ns <= POSE_NS:
-            return Motion(
+            return MspMotion(
                 climb_m_s=velocity[2],
                 height_m=pose.position_m[2] - self._ground.get("pose", 0.0),
                 velocity_m_s=velocity,
@@ -283,7 +283,7 @@ class MotionEstimate:
             )
         return self._by_itself(now_ns, yaw)
 
-    def _by_itself(self, now_ns: int, yaw: float | None) -> Motion:
+    def _by_itself(self, now_ns: int, yaw: float | None) -> MspMotion:
         climb = height = None
         if self._altitude is not None and now_ns - self._altitude[1] <= ALTITUDE_NS:
             climb = self._altitude[0].climb_m_s
@@ -296,7 +296,7 @@ class MotionEstimate:
             velocity = gps.speed_m_s * math.sin(course), gps.speed_m_s * math.cos(course), climb or 0.0
             east, north, up = origin.position_of(gps.latitude_deg, gps.longitude_deg, gps.altitude_m)
             position = east, north, up if height is None else height
-        return Motion(climb, height, velocity, position, yaw)
+        return MspMotion(climb, height, velocity, position, yaw)
 
 
 def _yaw(pose: ExternalPose) -> float:
@@ -320,9 +320,9 @@ def _scaled(vector: Vector, by: float) -> Vector:
 class Reported:
     """The newest reply of each kind; None if not received yet."""
 
-    attitude: Attitude | None = None
+    attitude: MspAttitude | None = None
     altitude: Altitude | None = None
-    status: Status | None = None
+    status: MspStatus | None = None
     battery: Battery | None = None
     cells: CellVoltages = field(default_factory=CellVoltages)
 
@@ -338,7 +338,7 @@ def charge_left(battery: Battery, cells: CellVoltages) -> float | None:
 
 
 def feedback_of(
-    reported: Reported, motion: Motion, flight: FlightState, captured_ns: int, native: dict[str, Value]
+    reported: Reported, motion: MspMotion, flight: FlightState, captured_ns: int, native: dict[str, Value]
 ) -> Feedback:
     """Return the vehicle's state as feedback. Unknown values are None."""
     attitude, battery = reported.attitude, reported.battery

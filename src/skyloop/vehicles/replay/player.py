@@ -30,7 +30,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
-from skyloop.recording.pictures import Picture
+from skyloop.recording.pictures import RecordedImage
 from skyloop.vehicles.replay.source import Moment, ReplaySource, TimedSample, Timeline
 
 POSITION: Final = "replay.position_s"
@@ -215,7 +215,7 @@ class ReplayPublisher:
         value = sample.value
         if isinstance(value, Feedback):
             return lambda: self.feedback(value, timeline, sample.at_ns)
-        if isinstance(value, Picture):
+        if isinstance(value, RecordedImage):
             show = self._decoded(value) if self._sink.wants(value.camera) else _nothing
             return lambda: self._picture(value, show, timeline)
         if isinstance(value, Event):
@@ -289,11 +289,11 @@ class ReplayPublisher:
             )
         )
 
-    def _picture(self, picture: Picture, show: Callable[[int], None], timeline: Timeline) -> None:
+    def _picture(self, picture: RecordedImage, show: Callable[[int], None], timeline: Timeline) -> None:
         self.frames += 1
         show(self._captured(picture.camera, picture.header.captured_ns, timeline))
 
-    def _decoded(self, picture: Picture) -> Callable[[int], None]:
+    def _decoded(self, picture: RecordedImage) -> Callable[[int], None]:
         """Decode an image; return a function that publishes it with a given capture time or, if damaged, an event."""
         try:
             pixels, encoding = picture.as_recorded()

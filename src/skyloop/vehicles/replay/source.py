@@ -13,15 +13,15 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
 from skyloop.recording.layout import Channel, DroneRecord
-from skyloop.recording.pictures import Picture
-from skyloop.recording.plain import Course, shifted
+from skyloop.recording.pictures import RecordedImage
+from skyloop.recording.plain import TimeCourse, shifted
 from skyloop.recording.reader import Item, Recording
 
 #: Channels that are replayed. Annotations and logs are not replayed, because applications create new ones.
 CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
 
 _SAME_CLOCK_NS: Final = nanoseconds(5.0)  #: tolerance within which two clocks that were not reset advance equally
-Sample = Feedback | Picture | Event | Applied | Parameter
+Sample = Feedback | RecordedImage | Event | Applied | Parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ class Moment:
 
     at_ns: int
     state: Feedback | None = None  #: state when the images were captured, or the newest state if there are no images
-    pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest image from each camera
+    pictures: dict[str, RecordedImage] = field(default_factory=dict)  #: the newest image from each camera
     command: Applied | None = None
     parameters: list[Parameter] = field(default_factory=list)  #: parameters received shortly before the moment
     following: Iterator[TimedSample] = field(default_factory=lambda: iter(()))
@@ -129,7 +129,7 @@ class ReplaySource:
         """Yield the samples received at the given log time or later."""
         resets = self._resets if log_ns else []  # when reading from the beginning, restarts are found along the way
         earlier = bisect_right(resets, log_ns, key=lambda reset: reset[0])
-        course = Course(resets[earlier - 1][1] if earlier else 0)
+        course = TimeCourse(resets[earlier - 1][1] if earlier else 0)
         for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
             value, at_log_ns = (found.value, found.entry.log_ns) if isinstance(found, Item) else (found, found.log_ns)
             at_ns = course.follow(value, at_log_ns)
@@ -148,7 +148,7 @@ class ReplaySource:
         passed_ns = last.value.published_ns - first.value.published_ns
         if abs(passed_ns - (last.entry.log_ns - first.entry.log_ns)) < _SAME_CLOCK_NS:
             return []  # avoids reading the whole file
-        found, course = [], Course()
+        found, course = [], TimeCourse()
         for item in self._recording.items(self._drone.name, (Channel.FEEDBACK,)):
             before_ns = course.shift_ns
             course.follow(item.value, item.entry.log_ns)
@@ -179,7 +179,7 @@ class ReplaySource:
                 break
             if isinstance(value, Feedback):
                 states.append(value)
-            elif isinstance(value, Picture):
+            elif isinstance(value, RecordedImage):
                 moment.pictures[value.camera] = value
             elif isinstance(value, Applied):
                 moment.command = value
@@ -192,7 +192,7 @@ class ReplaySource:
 _NEVER_NS: Final = 1 << 63  # later than any time of a sample
 
 
-def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
+def _state_of(states: Collection[Feedback], pictures: Mapping[str, RecordedImage]) -> Feedback | None:
     """Return the state when the newest image was captured, so that state and image match."""
     if not states:
         return None

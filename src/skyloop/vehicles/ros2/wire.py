@@ -151,7 +151,7 @@ def covariance(size: int, *, known: bool = True, variance: float = VARIANCE) -> 
 # Cameras ---------------------------------------------------------------------------------------------------------
 
 
-class CameraModel(NamedTuple):
+class RosCameraInfo(NamedTuple):
     """Content of a ``sensor_msgs/CameraInfo``, row by row; all zero if there are no intrinsics, as usual in ROS."""
 
     model: str
@@ -161,10 +161,10 @@ class CameraModel(NamedTuple):
     p: list[float]
 
 
-def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
+def camera_model(intrinsics: Intrinsics | None) -> RosCameraInfo:
     """Return the content of a ``sensor_msgs/CameraInfo`` for a camera's intrinsics."""
     if intrinsics is None:
-        return CameraModel("", [], [0.0] * 9, [0.0] * 9, [0.0] * 12)
+        return RosCameraInfo("", [], [0.0] * 9, [0.0] * 9, [0.0] * 12)
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     given = list(intrinsics.distortion)
     if intrinsics.model == "fisheye":
@@ -173,7 +173,7 @@ def camera_model(intrinsics: Intrinsics | None) -> CameraModel:
         model, many = "plumb_bob", 5
     else:
         model, many = "rational_polynomial", max(8, len(given))
-    return CameraModel(
+    return RosCameraInfo(
         model,
         given + [0.0] * (many - len(given)),
         [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],

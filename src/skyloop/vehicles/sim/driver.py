@@ -40,7 +40,7 @@ from skyloop.vehicles.sim.options import firmware_options, options_of
 from skyloop.vehicles.sim.telemetry import feedback_of
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera
+    from skyloop.sim.camera_pipeline import PipelineCamera
     from skyloop.vehicles.sim.firmware_flight import FirmwareFlight
 
 _OCCURRENCES: Final = {
@@ -84,8 +84,8 @@ class SimDriver(Driver):
         self._wind: Wind | None = None  # the value written before opening
         self._battery = self.options.battery
         self._link = True
-        self._setpoints: SetpointController | None = None
-        self._cameras: tuple[Camera, ...] = ()
+        self._setpoints: SimSetpoints | None = None
+        self._cameras: tuple[PipelineCamera, ...] = ()
         self._world: World | None = None
         self._firmware: FirmwareFlight | None = None  # None if the built-in autopilot flies the drone
         if self.options.autopilot is not None:
@@ -123,7 +123,7 @@ class SimDriver(Driver):
             self._firmware.open(host, self.drone, sink)
             self._cameras = host.attach(self.drone, self, self, list(self._models))
             return
-        self._setpoints = None if "takeoff" in self.options.native else SetpointController(simulation, self.drone)
+        self._setpoints = None if "takeoff" in self.options.native else SimSetpoints(simulation, self.drone)
         simulation.set_limits(self.drone, self._in_force(self._limits))
         self._cameras = host.attach(self.drone, self, self, list(self._models))
         sink.link(LinkState.UP)
@@ -310,7 +310,7 @@ LIFT_M_S: Final = 0.05  #: climb rate of a set-point above which the motors star
 DOWN_M: Final = 0.08  #: height below which a descending drone counts as landed
 
 
-class SetpointController:
+class SimSetpoints:
     """Starts the motors for a climbing set-point, and stops them on the ground for a descending set-point.
 
     The simulated firmware accepts set-points only in the air, so its own take-off to the lowest height comes first.

@@ -7,7 +7,7 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.h264 import Unit
-from skyloop.drivers.live_video import Coded, LiveVideo, Picture, StreamRelay, VideoEvent
+from skyloop.drivers.live_video import Coded, LiveFrame, LiveVideo, StreamRelay, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback, deliver
 from skyloop.errors import DriverError, ParameterError
@@ -105,7 +105,7 @@ class TelloDriver(Driver):
         return self._settings.write(name, value)
 
     def _start_video(self, sink: Sink, link: TelloLink, settings: DroneSettings) -> None:
-        def show(picture: Picture) -> None:
+        def show(picture: LiveFrame) -> None:
             camera = settings.camera
             picture.show(sink, camera, intrinsics(camera, picture.width, picture.height))
 

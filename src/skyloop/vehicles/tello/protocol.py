@@ -10,8 +10,8 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.drivers.vehicle_session import (
     KEPT_NS,
-    Arrival,
     LinkTimeouts,
+    PacketOrder,
     RestartWatch,
     VehicleEvent,
     VehicleSession,
@@ -21,8 +21,8 @@ from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, EmergencyStop, Hover, LinkState, Severity, Value
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import TelloOptions
-from skyloop.vehicles.tello.setpoints import SetpointController
-from skyloop.vehicles.tello.telemetry import Health, feedback_of
+from skyloop.vehicles.tello.setpoints import TelloSetpoints
+from skyloop.vehicles.tello.telemetry import TelloHealth, feedback_of
 from skyloop.vehicles.tello.wire import ENTER, HOST, Sdk, Shape, answers, decoded, is_error, parse, ports, shape_of
 
 PATIENCE_NS: Final = nanoseconds(0.3)  #: time allowed for a reply; real drones take at most 29 ms over a good link
@@ -34,7 +34,7 @@ Done = Callable[[str | None], None]
 
 
 @dataclass(slots=True)
-class Request:
+class TelloRequest:
     """A command to which a reply is expected."""
 
     text: str
@@ -54,15 +54,15 @@ class Conversation:
 
     def __init__(self) -> None:
         self.counts = Counter(dict.fromkeys(("answered", "unanswered", "stray"), 0))
-        self._queue: deque[Request] = deque()
-        self._asked: Request | None = None
+        self._queue: deque[TelloRequest] = deque()
+        self._asked: TelloRequest | None = None
         self._motions: dict[str, int] = {}  # when each motion that awaits its reply was last sent
 
     @property
     def idle(self) -> bool:
         return self._asked is None and not self._queue
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: TelloRequest) -> None:
         self._queue.append(request)
 
     def moved(self, text: str, now_ns: int) -> None:
@@ -114,7 +114,7 @@ class Conversation:
         self._asked.sent_ns = now_ns
         return [self._asked.text]
 
-    def _next(self) -> Request | None:
+    def _next(self) -> TelloRequest | None:
         for request in self._queue:
             if not self._motions or shape_of(request.text) is not Shape.OK:
                 self._queue.remove(request)
@@ -158,7 +158,7 @@ class TelloSession(VehicleSession):
     ) -> None:
         super().__init__(now_ns)
         self.options = options
-        self.setpoints = SetpointController()
+        self.setpoints = TelloSetpoints()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late"), 0))
         self._watch = RestartWatch()  # watches the count of seconds for which the motors have run
@@ -168,7 +168,7 @@ class TelloSession(VehicleSession):
         self.remembered: dict[str, str] = {}  #: last command for each parameter, to be resent after a link loss
         self._extra = extra
         self._video_ns = video_ns
-        self._health = Health()
+        self._health = TelloHealth()
         self._entered_ns = now_ns - ENTER_NS
         self._lost_ns = self._sent_ns = now_ns  # time of the link loss or of a later hover request; last datagram
         self._alive_ns = self._found_ns = now_ns  # time of the last periodic request; of the first state
@@ -189,7 +189,7 @@ class TelloSession(VehicleSession):
     # From the driver -------------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
-        """Accept an action and send it as soon as allowed; see :meth:`SetpointController.apply`."""
+        """Accept an action and send it as soon as allowed; see :meth:`TelloSetpoints.apply`."""
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns, new=new)
         self._keep(action, now_ns)
@@ -204,7 +204,7 @@ class TelloSession(VehicleSession):
 
     def ask(self, text: str, done: Done) -> None:
         """Send a command; ``done`` is called with the reply, or None if there is none."""
-        self.conversation.ask(Request(text, done))
+        self.conversation.ask(TelloRequest(text, done))
         self.due_ns = 0
 
     def flip(self, direction: str) -> None:
@@ -231,7 +231,7 @@ class TelloSession(VehicleSession):
         except DecodeError:
             self.counts["damaged"] += 1
             return
-        if state.motor_s is not None and self._watch.update(state.motor_s, now_ns) is Arrival.LATE:
+        if state.motor_s is not None and self._watch.update(state.motor_s, now_ns) is PacketOrder.LATE:
             self.counts["late"] += 1
             return
         self.counts["received"] += 1
@@ -326,10 +326,10 @@ class TelloSession(VehicleSession):
             return
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
             self._alive_ns = now_ns
-            self.conversation.ask(Request(ALIVE, self._alive))
+            self.conversation.ask(TelloRequest(ALIVE, self._alive))
         elif not self.ready and not self._asking_version:
             self._asking_version = True
-            self.conversation.ask(Request("sdk?", self._on_version))
+            self.conversation.ask(TelloRequest("sdk?", self._on_version))
 
     def _is_silent(self, now_ns: int) -> bool:
         """Return whether to withhold requests, because each one delays the automatic landing of a pilotless drone."""
@@ -352,7 +352,7 @@ class TelloSession(VehicleSession):
         missing = self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS
         if missing and self.conversation.idle and not self._is_silent(now_ns):
             self._asked_video_ns = now_ns
-            self.conversation.ask(Request("streamon", _ignore_reply))
+            self.conversation.ask(TelloRequest("streamon", _ignore_reply))
 
     def _describe_silence(self, since: str, why: str) -> str:
         if self._answered:
@@ -394,9 +394,9 @@ class TelloSession(VehicleSession):
             return
         self.sdk = _SDK.get(reply, Sdk.V1_3 if is_error(reply) else Sdk.V3_0)
         self.ready, self._deaf = True, 0
-        self.conversation.ask(Request("sn?", self._on_serial))
+        self.conversation.ask(TelloRequest("sn?", self._on_serial))
         for text in self.remembered.values():
-            self.conversation.ask(Request(text, _ignore_reply))
+            self.conversation.ask(TelloRequest(text, _ignore_reply))
         self._set_link_state(LinkState.UP)
 
     def _on_serial(self, reply: str | None) -> None:

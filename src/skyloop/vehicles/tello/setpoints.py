@@ -34,7 +34,7 @@ from skyloop.vehicles.tello.wire import (
     FULL_YAW_RATE_RAD_S,
     LEVEL,
     MAX_STICK,
-    Stick,
+    TelloStick,
     is_error,
 )
 
@@ -51,7 +51,7 @@ class Scale:
     tilt: float = FULL_TILT_RAD  #: [rad]
 
 
-def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
+def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[TelloStick, Velocity | Attitude]:
     """Return the stick values and the set-point that they command, within the limits and at most a full stick.
 
     The Tello holds a speed, not an attitude, so a tilt becomes a fraction of the full stick and thus of the full speed.
@@ -79,8 +79,8 @@ def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[
     return _stick(right, ahead, level.climb / full.climb, level.yaw_rate / full.yaw_rate), level
 
 
-def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
-    return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
+def _stick(right: float, forward: float, up: float, turn: float) -> TelloStick:
+    return TelloStick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
 
 
 AGAIN_NS: Final = nanoseconds(1.5)  #: time after which a take-off or landing without visible effect is repeated
@@ -98,7 +98,7 @@ class Decision(Enum):
     LAND = auto()
 
 
-class SetpointController:
+class TelloSetpoints:
     """Stores the last action and turns it into commands.
 
     ``full`` is the effect of a full stick, and ``limits`` is the largest set-point.
@@ -197,7 +197,7 @@ class SetpointController:
         self.watch.sinking = decision is Decision.LAND
         self.watch.landing_answered = False
 
-    def _remain(self, stick: Stick, now_ns: int) -> None:
+    def _remain(self, stick: TelloStick, now_ns: int) -> None:
         if self._decision is Decision.LAND and self.watch.phase is FlightState.LANDED:
             return  # otherwise a cancelled take-off could still happen
         if self._decision is Decision.LAND:
@@ -300,7 +300,7 @@ class SetpointController:
             return self._again(LAND, now_ns)
         return []
 
-    def stick(self) -> Stick | None:
+    def stick(self) -> TelloStick | None:
         """Return the stick values for ``rc``, or None to send none.
 
         None is returned if the drone is on the ground, taking off, landing, or flown by another program.

@@ -16,14 +16,14 @@ from skyloop.messages import Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.messages.parameter import Diagnostic
 from skyloop.vehicles.tello.options import VelocityAxes
-from skyloop.vehicles.tello.wire import GROUND_CM, Pad, State, Vector
+from skyloop.vehicles.tello.wire import GROUND_CM, Pad, TelloState, Vector
 
 # Feedback in SI ------------------------------------------------------------------------------------------------------
 
 STANDARD_GRAVITY: Final = 9.80665  #: [m/s²]
 
 
-def height_m(state: State) -> float | None:
+def height_m(state: TelloState) -> float | None:
     """Return the height [m]: as measured above the surface below or, without a measurement, above the take-off point.
 
     The distance sensor reports 10 cm both on the ground and at a height of 10 cm; the reported height tells them apart.
@@ -36,7 +36,7 @@ def height_m(state: State) -> float | None:
     return None
 
 
-def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
+def velocity_m_s(state: TelloState, axes: VelocityAxes) -> Vector | None:
     """Return the velocity forward, left, up [m/s] from values along ``axes``; None if unknown.
 
     ``vgx``, ``vgy`` and ``vgz`` are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
@@ -53,7 +53,7 @@ def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
 
 
 def feedback_of(
-    state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
+    state: TelloState, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
 ) -> Feedback:
     """Return the drone's state in SI units and our axes. Values that the drone does not report are None."""
     acceleration = state.acceleration_mg
@@ -121,7 +121,7 @@ class FlightWatch:
             return True
         return None if self._motor_s is None or now_ns - self._since_ns < STILL_NS else False
 
-    def update(self, state: State, now_ns: int) -> None:
+    def update(self, state: TelloState, now_ns: int) -> None:
         self._count(state.motor_s, now_ns)
         height = height_m(state)
         slow = state.speed_dm_s is None or abs(state.speed_dm_s[2]) <= SLOW_DM_S
@@ -175,7 +175,7 @@ COOL_C: Final = 85.0  #: temperature below which a hot drone no longer counts as
 PAD_LOST: Final = 5  #: number of consecutive states without a pad after which the pad counts as out of view
 
 
-class Health:
+class TelloHealth:
     """Reports changes in overheating and in the visible mission pad, each once."""
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class Health:
         self._pad = 0
         self._without = 0
 
-    def changes(self, state: State) -> list[VehicleEvent]:
+    def changes(self, state: TelloState) -> list[VehicleEvent]:
         """Return events for the changes since the last call."""
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
@@ -208,7 +208,7 @@ class Health:
         text = f"the drone is hot: {highest:g} °C" if hot else "no longer: the drone is hot"
         return [message(text, "hot", Severity.WARNING if hot else Severity.INFO, active=hot, celsius=highest)]
 
-    def _mission_pad(self, state: State) -> list[VehicleEvent]:
+    def _mission_pad(self, state: TelloState) -> list[VehicleEvent]:
         number = state.pad.number if state.pad is not None else 0
         self._without = 0 if number else self._without + 1
         if number == self._pad or (not number and self._without < PAD_LOST):

@@ -54,7 +54,7 @@ class Sdk(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Stick:
+class TelloStick:
     """Values of ``rc``, from -100 to 100. Positive values mean right, forward, up, and clockwise seen from above."""
 
     right: int = 0
@@ -67,7 +67,7 @@ class Stick:
         return f"rc {self.right} {self.forward} {self.up} {self.clockwise}"
 
 
-LEVEL: Final = Stick()
+LEVEL: Final = TelloStick()
 
 
 def ports(state: int, video: int) -> str:
@@ -156,7 +156,7 @@ class Pad:
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class TelloState:
     """A state string. Values are None if they are missing or have the drone's value for "unknown"."""
 
     pitch_deg: float | None = None
@@ -175,7 +175,7 @@ class State:
     fields: tuple[tuple[str, float | Vector], ...] = ()  #: all fields, as sent
 
 
-def parse(datagram: bytes) -> State:
+def parse(datagram: bytes) -> TelloState:
     """Return the state in a datagram, leaving out invalid fields; raise :class:`DecodeError` if none is valid.
 
     The last field of a truncated string is dropped, unless its semicolon is present.
@@ -201,7 +201,7 @@ def parse(datagram: bytes) -> State:
     return _state(fields)
 
 
-def _state(fields: dict[str, float | Vector]) -> State:
+def _state(fields: dict[str, float | Vector]) -> TelloState:
     def number(name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
         value = fields.get(name)
         return value if isinstance(value, float) and low <= value <= high else None
@@ -212,7 +212,7 @@ def _state(fields: dict[str, float | Vector]) -> State:
 
     low, high = number("templ", -50, 150), number("temph", -50, 150)
     motor_s = number("time", 0)
-    return State(
+    return TelloState(
         pitch_deg=number("pitch", -180, 180),
         roll_deg=number("roll", -180, 180),
         yaw_deg=number("yaw", -360, 360),

@@ -21,7 +21,7 @@ from skyloop.messages import (
 )
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration
-from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S, Progress, limits_of, set_point
+from skyloop.vehicles.ardrone.emulator.flight import CALIBRATION_RATE_RAD_S, ProgressCommand, limits_of, set_point
 from skyloop.vehicles.ardrone.wire.at import Pcmd, Ref
 from skyloop.vehicles.ardrone.wire.navdata import State
 from tests.vehicles.ardrone.emulator.rig import RESTING, Bench
@@ -248,7 +248,7 @@ def test_set_points_are_finite(
 ) -> None:
     configuration = Configuration(2)
     configuration.write("control:control_level", "2")
-    progress = Progress(flags, *values, heading)
+    progress = ProgressCommand(flags, *values, heading)
     if progress.makes_sense:
         assert set_point(progress, configuration, yaw_rad=yaw, forward_m_s=speed).finite
 

@@ -9,8 +9,8 @@ import pytest
 
 from skyloop.messages import FlightState
 from skyloop.vehicles.ardrone.emulator import MOST, Listeners
-from skyloop.vehicles.ardrone.emulator.flight import Progress
-from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
+from skyloop.vehicles.ardrone.emulator.flight import ProgressCommand
+from skyloop.vehicles.ardrone.emulator.telemetry import ArdroneSnapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.emulator.video import DroneClock
 from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.navdata import ControlState, Navdata, decode, encode
@@ -32,13 +32,13 @@ MOVING = replace(
 )
 
 
-def told(snapshot: Snapshot, tags: list[int] = EVERY) -> Navdata:
+def told(snapshot: ArdroneSnapshot, tags: list[int] = EVERY) -> Navdata:
     """Return the options after encoding and decoding."""
     return decode(encode(0, 1, options_of(snapshot, tags)))
 
 
 def of_moving() -> Navdata:
-    return told(Snapshot(MOVING, FlightState.FLYING, time=77, thrust=0.95, link_quality=90))
+    return told(ArdroneSnapshot(MOVING, FlightState.FLYING, time=77, thrust=0.95, link_quality=90))
 
 
 def test_the_demo_option() -> None:
@@ -65,14 +65,14 @@ def test_the_demo_option() -> None:
     ],
 )
 def test_the_control_state(state: FlightState, shown: int) -> None:
-    demo = told(Snapshot(RESTING, state, time=0)).get(o.Demo)
+    demo = told(ArdroneSnapshot(RESTING, state, time=0)).get(o.Demo)
     assert demo is not None
     assert demo.ctrl_state == shown
 
 
 def test_a_flip_shows_in_the_air() -> None:
     for state, shown in ((FlightState.HOVERING, ControlState.LOOPING), (FlightState.LANDED, ControlState.LANDED)):
-        demo = told(Snapshot(RESTING, state, time=0, flipping=True)).get(o.Demo)
+        demo = told(ArdroneSnapshot(RESTING, state, time=0, flipping=True)).get(o.Demo)
         assert demo is not None
         assert demo.ctrl_state >> 16 == shown
 
@@ -106,7 +106,7 @@ def test_other_values_from_the_simulation() -> None:
 
 
 def test_a_flat_trim_shifts_level() -> None:
-    navdata = told(Snapshot(MOVING, FlightState.LANDED, time=0, trim_rad=(0.1, 0.2)))
+    navdata = told(ArdroneSnapshot(MOVING, FlightState.LANDED, time=0, trim_rad=(0.1, 0.2)))
     demo, trims = navdata.get(o.Demo), navdata.get(o.Trims)
     assert demo is not None
     assert (demo.theta, demo.phi) == pytest.approx((0.0, 0.0), abs=0.01)
@@ -123,10 +123,11 @@ def test_values_out_of_a_fields_range_are_clamped() -> None:
     wild = replace(
         MOVING, altitude_m=-3.0, battery_v=1e9, angular_velocity_rad_s=(1e6,) * 3, acceleration_m_s2=(-1e6,) * 3
     )
-    progress = Progress(1, 1e30, -1e30, 1e30, 0.0)
+    progress = ProgressCommand(1, 1e30, -1e30, 1e30, 0.0)
     video = VideoStatus(1 << 40, 1 << 40, 1)
     assert (
-        len(told(Snapshot(wild, FlightState.FLYING, time=0, thrust=9.0, progress=progress, video=video)).options) == 28
+        len(told(ArdroneSnapshot(wild, FlightState.FLYING, time=0, thrust=9.0, progress=progress, video=video)).options)
+        == 28
     )
 
 

@@ -12,11 +12,11 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.mavlink.emulator import Kind
-from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
-from skyloop.vehicles.mavlink.emulator.links import Streams
+from skyloop.vehicles.mavlink.emulator.arducopter import EmulatedArduCopter
+from skyloop.vehicles.mavlink.emulator.links import LinkIntervals
 from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
-from skyloop.vehicles.mavlink.emulator.px4 import Px4
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message, Texts
+from skyloop.vehicles.mavlink.emulator.px4 import EmulatedPx4
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message, Texts
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 TICK_STEPS = 4
@@ -26,10 +26,10 @@ HOME_M = 488.0
 class Wire:
     """A link that records sent messages."""
 
-    def __init__(self, streams: Streams) -> None:
+    def __init__(self, streams: LinkIntervals) -> None:
         self.streams = streams
         self.sent: list[Message] = []
-        self._out, self._in = Codec(1, 1), Codec(255, 190)
+        self._out, self._in = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
 
     def send(self, message: Message) -> None:
         self.sent += self._in.decode(self._out.encode(message), whole=True)
@@ -43,13 +43,13 @@ class Rig:
     def __init__(self, kind: Kind, *, boot_s: float = 1.0, gps: bool = True) -> None:
         vehicle = with_ideal_sensors(VehicleParameters())
         self.simulation = Simulation(load_world("empty"), 1, seed=1, parameters=vehicle)
-        made = ArduCopter if kind is Kind.ARDUCOPTER else Px4
+        made = EmulatedArduCopter if kind is Kind.ARDUCOPTER else EmulatedPx4
         self.autopilot = made(SimulatedVehicle(self.simulation, 0), 1, boot_s, gps)
-        self.wire = Wire(Streams(made.RATES))
+        self.wire = Wire(LinkIntervals(made.RATES))
         self.autopilot.ports = (self.wire,)
         self.kind = kind
-        self._program = Codec(255, 190)
-        self._ears = Codec(1, 1)
+        self._program = MavlinkCodec(255, 190)
+        self._ears = MavlinkCodec(1, 1)
         self._texts = Texts()
         self._now_ns = 0
         self.heartbeats = True
@@ -81,7 +81,7 @@ class Rig:
             highest = max(highest, self.height)
         return highest
 
-    def say(self, message: Message, codec: Codec | None = None) -> None:
+    def say(self, message: Message, codec: MavlinkCodec | None = None) -> None:
         (came,) = self._ears.decode((codec or self._program).encode(message), whole=True)
         self.autopilot.on_message(self.wire, came, self._now_ns)
 

@@ -11,7 +11,7 @@ from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.vehicles.mavlink.emulator import Kind
 from skyloop.vehicles.mavlink.emulator.manoeuvres import geodetic
 from skyloop.vehicles.mavlink.wire.axes import to_wire
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.vehicles.mavlink.emulator.rig import HOME_M, Rig
 
@@ -263,7 +263,7 @@ def test_by_default_and_for_other_systems_silence_has_no_effect() -> None:
     it.go_on(10.0, it.velocity(0, 0, 0))
     assert it.autopilot.mode == "GUIDED"
     it.autopilot.parameters["FS_GCS_ENABLE"] = 7
-    other = Codec(245, 190)
+    other = MavlinkCodec(245, 190)
     for _ in range(5):
         it.say(m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), other)
         it.say(it.velocity(0.5, 0, 0), other)

@@ -17,8 +17,8 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import PATIENCE_S
 from skyloop.vehicles.emulation.emulator import Loop
 from skyloop.vehicles.mavlink.emulator import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.vehicles.mavlink.emulator.links import Streams
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.emulator.links import LinkIntervals
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.vehicles.mavlink.emulator.rig import Rig
 
@@ -38,7 +38,7 @@ def listening(port: int) -> Iterator[socket.socket]:
 
 
 def heard(sock: socket.socket, kind: str) -> Message:
-    codec = Codec(255, 190)
+    codec = MavlinkCodec(255, 190)
     for _ in range(2000):
         for message in codec.decode(sock.recv(2048), whole=True):
             if message.get_type() == kind:
@@ -52,7 +52,7 @@ def test_it_sends_to_its_remote_port_then_to_the_sender(kind: Kind) -> None:
     with listening(ports.remote) as first, MavlinkFirmware(host(), kind=kind, ports=ports) as firmware:
         assert heard(first, "HEARTBEAT").autopilot == firmware.autopilot.AUTOPILOT
         with listening(0) as other:
-            program = Codec(255, 190)
+            program = MavlinkCodec(255, 190)
             other.sendto(program.encode(m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)), ("127.0.0.1", ports.udp))
             assert heard(other, "HEARTBEAT").get_srcSystem() == 1
 
@@ -90,7 +90,7 @@ def test_ports_in_use_and_invalid_settings_are_refused() -> None:
 
 
 def test_rates_are_kept_and_reported() -> None:
-    streams = Streams({1: 10.0})
+    streams = LinkIntervals({1: 10.0})
     assert [streams.due(at / 100) for at in (0, 5, 10, 11, 20)] == [[1], [], [1], [], [1]]
     streams.set_interval(1, -1)
     assert (streams.interval_us(1), streams.due(1.0)) == (-1, [])

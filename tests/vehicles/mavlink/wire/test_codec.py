@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.support.recordings import recorded
 
@@ -25,7 +25,7 @@ def attitude(boot_ms: int = 1234) -> Message:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_message_comes_back_with_its_sender(version: int) -> None:
-    sender, receiver = Codec(7, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(7, 1), MavlinkCodec(255, 190)
     frame = sender.encode(attitude(), version=version)
     assert frame[0] == (0xFE if version == 1 else 0xFD)
     (back,) = receiver.decode(frame)
@@ -35,7 +35,7 @@ def test_a_message_comes_back_with_its_sender(version: int) -> None:
 
 
 def test_frames_are_numbered() -> None:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     numbers = [receiver.decode(sender.encode(attitude()))[0].get_seq() for _ in range(257)]
     assert numbers[:3] == [0, 1, 2]
     assert numbers[256] == 0
@@ -43,7 +43,7 @@ def test_frames_are_numbered() -> None:
 
 @given(st.lists(st.integers(1, 60), max_size=30))
 def test_a_stream_may_be_cut_anywhere(cuts: list[int]) -> None:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     stream = b"".join(sender.encode(attitude(n), version=1 + n % 2) for n in range(6))
     found: list[Message] = []
     for cut in cuts:
@@ -54,23 +54,23 @@ def test_a_stream_may_be_cut_anywhere(cuts: list[int]) -> None:
 
 
 def test_a_cut_datagram_spoils_no_other() -> None:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     assert receiver.decode(sender.encode(attitude())[:20], whole=True) == []
     assert len(receiver.decode(sender.encode(attitude()), whole=True)) == 1
 
 
 @given(st.binary(max_size=600))
 def test_noise_never_raises(noise: bytes) -> None:
-    receiver = Codec(255, 190)
+    receiver = MavlinkCodec(255, 190)
     receiver.decode(noise)
     receiver.decode(noise, whole=True)
-    signed = Codec(255, 190, key=KEY)
+    signed = MavlinkCodec(255, 190, key=KEY)
     signed.decode(noise)
 
 
 @given(st.integers(0, 40 * 8 - 1), st.booleans())
 def test_a_flipped_bit_is_detected(bit: int, whole: bool) -> None:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     frame = bytearray(sender.encode(attitude()))
     frame[bit // 8 % len(frame)] ^= 1 << bit % 8
     assert receiver.decode(bytes(frame), whole=whole) == []
@@ -81,7 +81,7 @@ def test_a_flipped_bit_is_detected(bit: int, whole: bool) -> None:
 
 
 def test_unknown_messages_are_counted() -> None:
-    receiver = Codec(255, 190)
+    receiver = MavlinkCodec(255, 190)
     number = 0xABCDEF
     frame = struct.pack("<BBBBBBBHB", 0xFD, 1, 0, 0, 0, 1, 1, number & 0xFFFF, number >> 16) + b"\x01\x00\x00"
     assert receiver.decode(frame, whole=True) == []
@@ -89,29 +89,29 @@ def test_unknown_messages_are_counted() -> None:
 
 
 def test_signed_frames_need_the_key() -> None:
-    sender, receiver = Codec(1, 1, key=KEY), Codec(255, 190, key=KEY)
+    sender, receiver = MavlinkCodec(1, 1, key=KEY), MavlinkCodec(255, 190, key=KEY)
     first = sender.encode(attitude())
     assert len(receiver.decode(first)) == 1
     assert receiver.decode(first) == [], "a frame is accepted only once"
     assert len(receiver.decode(sender.encode(attitude()))) == 1
-    assert Codec(255, 190, key=bytes(32)).decode(sender.encode(attitude())) == []
-    assert receiver.decode(Codec(1, 1).encode(attitude())) == [], "not signed"
+    assert MavlinkCodec(255, 190, key=bytes(32)).decode(sender.encode(attitude())) == []
+    assert receiver.decode(MavlinkCodec(1, 1).encode(attitude())) == [], "not signed"
 
 
 def test_signatures_without_a_key_are_distinguished_from_damage() -> None:
-    sender, receiver = Codec(1, 1, key=KEY), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1, key=KEY), MavlinkCodec(255, 190)
     assert receiver.decode(sender.encode(attitude())) == []
     assert (receiver.signed, receiver.damaged) == (1, 0)
 
 
 def test_a_key_has_32_bytes() -> None:
     with pytest.raises(UsageError, match="32 bytes"):
-        Codec(255, 190, key=b"short")
+        MavlinkCodec(255, 190, key=b"short")
 
 
 def test_a_recorded_flight_decodes_in_full() -> None:
     """Each frame follows eight bytes of time. All 417 of 5.9 s decode; the file ends within the next one."""
-    data, receiver, at = recorded(FLIGHT).read_bytes(), Codec(255, 190), 0
+    data, receiver, at = recorded(FLIGHT).read_bytes(), MavlinkCodec(255, 190), 0
     kinds: Counter[str] = Counter()
     times: list[int] = []
     while at + 9 < len(data) and at + data[at + 9] + 16 <= len(data):
@@ -133,17 +133,17 @@ def test_a_damaged_recording_never_raises(data: st.DataObject) -> None:
     flight = bytearray(recorded(FLIGHT).read_bytes()[:2048])
     for _ in range(data.draw(st.integers(1, 30))):
         flight[data.draw(st.integers(0, len(flight) - 1))] = data.draw(st.integers(0, 255))
-    Codec(255, 190).decode(bytes(flight))
+    MavlinkCodec(255, 190).decode(bytes(flight))
 
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_datagram_decodes_like_the_same_bytes_of_a_stream(version: int) -> None:
-    sender = Codec(1, 1)
+    sender = MavlinkCodec(1, 1)
     one, two = (sender.encode(attitude(n), version=version) for n in range(2))
     damaged = one[:-1] + bytes([one[-1] ^ 1])
     for data, numbers, wrong in ((one, [0], 0), (one + two, [0, 1], 0), (b"\0" + one, [0], 1), (damaged, [], 1)):
         for whole in (True, False):
-            receiver = Codec(255, 190)
+            receiver = MavlinkCodec(255, 190)
             assert [each.time_boot_ms for each in receiver.decode(data, whole=whole)] == numbers
             assert (receiver.frames, receiver.damaged) == (len(numbers), wrong)
 
@@ -164,8 +164,8 @@ def values(kind: type[Message]) -> st.SearchStrategy[list[Any]]:
 def test_a_numeric_message_equals_pymavlinks(data: st.DataObject, version: int) -> None:
     kinds = [kind for kind in NUMBERS if version == 2 or kind.id < 256]
     kind = data.draw(st.sampled_from(kinds))
-    frame = Codec(7, 1).encode(kind(*data.draw(values(kind))), version=version)
-    (ours,) = Codec(255, 190).decode(frame, whole=True)
+    frame = MavlinkCodec(7, 1).encode(kind(*data.draw(values(kind))), version=version)
+    (ours,) = MavlinkCodec(255, 190).decode(frame, whole=True)
     theirs = m.MAVLink(None).decode(bytearray(frame))
     assert type(ours) is type(theirs)
     assert vars(ours.get_header()) == vars(theirs.get_header())
@@ -178,21 +178,21 @@ def _attributes(message: Message) -> dict[str, str]:
 
 
 def test_a_longer_payload_than_known_is_cut() -> None:
-    frame = bytearray(Codec(7, 1).encode(attitude()))
+    frame = bytearray(MavlinkCodec(7, 1).encode(attitude()))
     frame[1] += 2  # a later version of the message has another field
     frame[-2:] = b"\1\2"
     extra = bytes([m.MAVLink_attitude_message.crc_extra])
     frame += m.x25crc(bytes(frame[1:]) + extra).crc.to_bytes(2, "little")
-    (back,) = Codec(255, 190).decode(bytes(frame), whole=True)
+    (back,) = MavlinkCodec(255, 190).decode(bytes(frame), whole=True)
     assert back.yawspeed == 0.5
 
 
 def test_a_signed_datagram_is_checked_like_a_stream() -> None:
-    sender, receiver, keyless = Codec(1, 1, key=KEY), Codec(255, 190, key=KEY), Codec(255, 190)
+    sender, receiver, keyless = MavlinkCodec(1, 1, key=KEY), MavlinkCodec(255, 190, key=KEY), MavlinkCodec(255, 190)
     frame = sender.encode(attitude())
     assert len(receiver.decode(frame, whole=True)) == 1
     assert receiver.decode(frame, whole=True) == [], "a frame is accepted only once"
-    assert receiver.decode(Codec(1, 1).encode(attitude()), whole=True) == [], "not signed"
+    assert receiver.decode(MavlinkCodec(1, 1).encode(attitude()), whole=True) == [], "not signed"
     assert keyless.decode(frame, whole=True) == []
     assert (keyless.signed, keyless.damaged) == (1, 0)
 
@@ -200,7 +200,7 @@ def test_a_signed_datagram_is_checked_like_a_stream() -> None:
 @pytest.mark.parametrize("size", [1, 20, 64, 200])
 def test_a_stream_may_be_cut_across_datagrams(size: int) -> None:
     """As by a bridge from a serial line to the network; another sender's datagrams arrive in the middle."""
-    sender, receiver, other = Codec(1, 1), Codec(255, 190), Codec(2, 1)
+    sender, receiver, other = MavlinkCodec(1, 1), MavlinkCodec(255, 190), MavlinkCodec(2, 1)
     stream = b"".join(sender.encode(attitude(n), version=1 + n % 2) for n in range(220))
     found: list[Message] = []
     for at in range(0, len(stream), size):
@@ -211,7 +211,7 @@ def test_a_stream_may_be_cut_across_datagrams(size: int) -> None:
 
 
 def test_a_cut_stream_continues_after_a_lost_datagram() -> None:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     stream = b"".join(sender.encode(attitude(n)) for n in range(200))
     pieces = [stream[at : at + 100] for at in range(0, len(stream), 100)]
     del pieces[::10]
@@ -220,7 +220,7 @@ def test_a_cut_stream_continues_after_a_lost_datagram() -> None:
 
 
 def test_a_sender_of_fragments_can_not_fill_the_memory() -> None:
-    receiver = Codec(255, 190)
+    receiver = MavlinkCodec(255, 190)
     for sender in range(1000):
         receiver.decode(b"\xfd\xff", whole=True, source=sender)
     assert len(receiver._rests) <= 16
@@ -240,10 +240,10 @@ class Wall:
 def test_the_time_of_signatures_advances(monkeypatch: pytest.MonkeyPatch) -> None:
     """A vehicle switched on 80 s later accepts our frames, although it may be behind by at most a minute."""
     wall = Wall(monkeypatch)
-    ours = Codec(255, 190, key=KEY)
+    ours = MavlinkCodec(255, 190, key=KEY)
     ours.encode(attitude())
     wall.now_s += 80
-    vehicle = Codec(1, 1, key=KEY)
+    vehicle = MavlinkCodec(1, 1, key=KEY)
     assert len(vehicle.decode(ours.encode(attitude()))) == 1
     assert len(ours.decode(vehicle.encode(attitude()))) == 1
 
@@ -251,10 +251,10 @@ def test_the_time_of_signatures_advances(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_clock_that_was_never_set_signs_and_follows_the_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
     """1970, as on a computer without a clock; the vehicle has satellite time."""
     wall = Wall(monkeypatch)
-    vehicle = Codec(1, 1, key=KEY)
+    vehicle = MavlinkCodec(1, 1, key=KEY)
     first = vehicle.encode(attitude())
     wall.now_s = 0.0
-    ours = Codec(255, 190, key=KEY)
+    ours = MavlinkCodec(255, 190, key=KEY)
     assert vehicle.decode(ours.encode(attitude())) == [], "an old frame"
     assert len(ours.decode(first)) == 1
     assert len(vehicle.decode(ours.encode(attitude()))) == 1
@@ -262,7 +262,7 @@ def test_a_clock_that_was_never_set_signs_and_follows_the_vehicles(monkeypatch: 
 
 def test_a_signature_is_never_repeated_after_the_clock_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = Wall(monkeypatch)
-    ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
+    ours, vehicle = MavlinkCodec(255, 190, key=KEY), MavlinkCodec(1, 1, key=KEY)
     for _ in range(3):
         assert len(vehicle.decode(ours.encode(attitude()))) == 1
         wall.now_s -= 10.0
@@ -270,7 +270,7 @@ def test_a_signature_is_never_repeated_after_the_clock_goes_back(monkeypatch: py
 
 def test_a_sender_without_the_key_locks_no_one_out() -> None:
     """A forged frame from the far future changes nothing."""
-    ours, vehicle = Codec(255, 190, key=KEY), Codec(1, 1, key=KEY)
+    ours, vehicle = MavlinkCodec(255, 190, key=KEY), MavlinkCodec(1, 1, key=KEY)
     forged = bytearray(vehicle.encode(attitude()))
     forged[-12:-6] = b"\xff" * 6
     assert ours.decode(bytes(forged)) == []

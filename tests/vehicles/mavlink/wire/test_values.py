@@ -13,7 +13,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.vehicles.mavlink.wire import axes, codec
 from skyloop.vehicles.mavlink.wire.codec import (
-    Codec,
+    MavlinkCodec,
     Message,
     Texts,
     bounds,
@@ -63,7 +63,7 @@ def test_any_field_is_read_or_refused(field: float, kind: int, bytewise: bool) -
 
 
 def travelled(messages: list[Message]) -> list[Message]:
-    sender, receiver = Codec(1, 1), Codec(255, 190)
+    sender, receiver = MavlinkCodec(1, 1), MavlinkCodec(255, 190)
     return [receiver.decode(sender.encode(message), whole=True)[0] for message in messages]
 
 

@@ -13,7 +13,7 @@ from skyloop.errors import DecodeError
 from skyloop.vehicles.msp.wire import firmwares
 from skyloop.vehicles.msp.wire import messages as msp
 from skyloop.vehicles.msp.wire.firmwares import explained, flag_names
-from skyloop.vehicles.msp.wire.messages import Sensor, Status
+from skyloop.vehicles.msp.wire.messages import MspStatus, Sensor
 
 #: Answers of Betaflight 4.6.0 SITL, at rest and unconfigured.
 STATUS_EX = bytes.fromhex("7d0000002300000000000000000400001d0403000000000004")
@@ -25,25 +25,25 @@ PID_ADVANCED = bytes(17) + bytes.fromhex("3c000000500000000000010100050078007d00
 
 
 def test_status() -> None:
-    status = Status.of_betaflight(STATUS_EX)
+    status = MspStatus.of_betaflight(STATUS_EX)
     assert status.has(Sensor.ACCELEROMETER)
     assert status.has(Sensor.BAROMETER)
     assert not status.has(Sensor.GPS)
     assert (status.count, status.cycle_us, status.modes) == (29, 125, 0)
     assert status.flags is not None
     assert flag_names("BTFL", status.flags, status.count) == ["RXLOSS", "ANGLE", "BOOTGRACE"]
-    assert Status.of_betaflight(STATUS_EX[:15]).flags is None, "an old version does not report them"
+    assert MspStatus.of_betaflight(STATUS_EX[:15]).flags is None, "an old version does not report them"
 
 
 @given(st.integers(0, 2**60 - 1), st.integers(0, 2**29 - 1), st.integers(0, 127))
 def test_status_both_ways(modes: int, flags: int, sensors: int) -> None:
-    status = Status(sensors, modes, flags, 29, 312, 20)
-    assert Status.of_betaflight(status.betaflight()) == status
+    status = MspStatus(sensors, modes, flags, 29, 312, 20)
+    assert MspStatus.of_betaflight(status.betaflight()) == status
 
 
 def test_status_of_inav() -> None:
     payload = bytes.fromhex("f4010000 6300 0500 10 04000c00 0300000000000000 00".replace(" ", ""))
-    status = Status.of_inav(payload)
+    status = MspStatus.of_inav(payload)
     assert (status.sensors, status.load, status.modes) == (0x63, 5, 3)
     assert status.flags == 0x000C0004
     assert flag_names("INAV", status.flags, 32) == ["RC_LINK", "THROTTLE"]
@@ -79,8 +79,8 @@ def test_mode_ranges() -> None:
 def test_states_both_ways() -> None:
     gps = msp.Gps(True, 14, 47.3977419, -8.5455938, 488.0, 1.23, 359.9)
     assert msp.Gps.decode(gps.encode()) == gps
-    attitude = msp.Attitude(-12.3, 4.5, 271.0)
-    assert msp.Attitude.decode(attitude.encode()) == attitude
+    attitude = msp.MspAttitude(-12.3, 4.5, 271.0)
+    assert msp.MspAttitude.decode(attitude.encode()) == attitude
     altitude = msp.Altitude(-1.25, 0.4)
     assert msp.Altitude.decode(altitude.encode()) == altitude
     imu = msp.Imu((1, -2, 512), (-200, 3, 0), (7, 8, 9))
@@ -104,9 +104,9 @@ READERS: list[Callable[[bytes], object]] = [
     msp.api_version,
     msp.version,
     msp.board,
-    Status.of_betaflight,
-    Status.of_inav,
-    msp.Attitude.decode,
+    MspStatus.of_betaflight,
+    MspStatus.of_inav,
+    msp.MspAttitude.decode,
     msp.Altitude.decode,
     msp.Battery.of_state,
     msp.Battery.of_inav,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.vehicles.sim.firmware.betaflight import (
-    FlightState,
+    BetaflightState,
     decode_motors,
     decode_state,
     encode_motors,
@@ -25,7 +25,7 @@ single = st.floats(0, 1, width=32)
 
 @given(
     st.builds(
-        FlightState,
+        BetaflightState,
         time_s=number,
         gyro_rad_s=vector,
         acceleration_m_s2=vector,
@@ -35,14 +35,14 @@ single = st.floats(0, 1, width=32)
         pressure_pa=number,
     )
 )
-def test_states_survive_a_round_trip(state: FlightState) -> None:
+def test_states_survive_a_round_trip(state: BetaflightState) -> None:
     data = encode_state(state)
     assert len(data) == 144
     assert decode_state(data) == state
 
 
 def test_a_state_has_betaflights_layout() -> None:
-    state = FlightState(1.0, (2, 3, 4), (5, 6, 7), (8, 9, 10, 11), (12, 13, 14), (15, 16, 17), 18.0)
+    state = BetaflightState(1.0, (2, 3, 4), (5, 6, 7), (8, 9, 10, 11), (12, 13, 14), (15, 16, 17), 18.0)
     assert struct.unpack("<18d", encode_state(state)) == tuple(range(1, 19))
 
 

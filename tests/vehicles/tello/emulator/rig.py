@@ -18,7 +18,7 @@ from skyloop.vehicles.emulation.emulator import Address
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.tello.emulator import LIMITS, TELLO
 from skyloop.vehicles.tello.emulator.logic import TelloLogic
-from skyloop.vehicles.tello.wire import Sdk, State, parse
+from skyloop.vehicles.tello.wire import Sdk, TelloState, parse
 
 TICK_S: Final = 0.02
 PILOT: Final = ("10.0.0.2", 9000)
@@ -86,7 +86,7 @@ class Bench:
         return self.truth.state
 
     @property
-    def state(self) -> State:
+    def state(self) -> TelloState:
         datagram = self.logic.state_string()
         assert datagram is not None
         return parse(datagram)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.vehicles.tello.wire import State, build, parse
+from skyloop.vehicles.tello.wire import TelloState, build, parse
 from tests.vehicles.tello.rig import strings
 
 
@@ -94,4 +94,4 @@ def test_no_bytes_raise_anything_else(datagram: bytes) -> None:
         state = parse(datagram)
     except DecodeError:
         return
-    assert isinstance(state, State)
+    assert isinstance(state, TelloState)

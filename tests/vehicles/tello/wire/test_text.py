@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.vehicles.tello.wire import LEVEL, READ, Sdk, Stick, answers, decoded, is_error, ports
+from skyloop.vehicles.tello.wire import LEVEL, READ, Sdk, TelloStick, answers, decoded, is_error, ports
 
 
 def test_commands_match_the_guide() -> None:
-    assert Stick(right=-10, forward=20, up=0, clockwise=100).text == "rc -10 20 0 100"
+    assert TelloStick(right=-10, forward=20, up=0, clockwise=100).text == "rc -10 20 0 100"
     assert LEVEL.text == "rc 0 0 0 0"
     assert ports(8891, 11112) == "port 8891 11112"
 

@@ -30,7 +30,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import AR_DRONE
 from skyloop.vehicles.ardrone.emulator.logic import ArdroneLogic, VideoSettings
-from skyloop.vehicles.ardrone.emulator.telemetry import Snapshot, options_of, tags_of
+from skyloop.vehicles.ardrone.emulator.telemetry import ArdroneSnapshot, options_of, tags_of
 from skyloop.vehicles.ardrone.emulator.video import CAMERAS, DroneClock, PavePacker, UvlcPacker
 from skyloop.vehicles.ardrone.wire import navdata
 from skyloop.vehicles.ardrone.wire.navdata import FIRST_SEQUENCE, STANDARD, Ports
@@ -48,7 +48,7 @@ from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import Packer, Piece, VideoEncoding, require_encoder
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera
+    from skyloop.sim.camera_pipeline import PipelineCamera
 
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]
 
@@ -65,7 +65,7 @@ def with_ardrones(options: SimOptions | None = None) -> SimOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class ArdroneSettings:
     """The arguments passed to :class:`skyloop.vehicles.ardrone.emulator.ArdroneFirmware`."""
 
     version: int
@@ -243,7 +243,7 @@ DEMO_HZ: Final = 15.0  #: rate of navdata in demo mode
 class RunningFirmware(RunningEmulator):
     """An AR.Drone that is switched on. Use its logic, ports and lists of clients only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: ArdroneSettings) -> None:
         super().__init__(host, drone, "skyloop-ardrone")
         self._settings = settings
         self._clock = DroneClock(monotonic_ns())
@@ -255,7 +255,7 @@ class RunningFirmware(RunningEmulator):
         self.logic = ArdroneLogic(vehicle, self._send_text, monotonic_ns, version=settings.version)
         self._shown = self.logic.video
         self._video = self._encoding = VideoEncoding(self._packer(), lambda: self._shown, self._encoded)
-        self._cameras: tuple[Camera, ...] = ()
+        self._cameras: tuple[PipelineCamera, ...] = ()
         try:
             self._open_ports(settings.ports)
             self._encoding.start()
@@ -335,9 +335,9 @@ class RunningFirmware(RunningEmulator):
         for client, sequence in self._navdata_clients.next_sequences():
             self._navdata_port.send(navdata.encode(state, sequence, options, vision), client)
 
-    def _snapshot(self, report: Report) -> Snapshot:
+    def _snapshot(self, report: Report) -> ArdroneSnapshot:
         flight = self.logic.flight
-        return Snapshot(
+        return ArdroneSnapshot(
             believed=report.believed,
             state=report.believed.state,
             time=self._clock.navdata_time(report.captured_ns),
@@ -455,7 +455,7 @@ class ArdroneFirmware(Emulator[RunningFirmware]):
         if version > 1:
             require_encoder()
         super().__init__(host, drone)
-        self.settings = Settings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
+        self.settings = ArdroneSettings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)

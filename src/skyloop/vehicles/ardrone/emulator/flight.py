@@ -32,7 +32,7 @@ _COMBINED_YAW_LEVEL: Final = 2  # bit 1 of control:control_level
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class ProgressCommand:
     """A ``PCMD`` or ``PCMD_MAG`` as received.
 
     ``heading`` is the remote control's heading, clockwise from north, as a fraction of 180°; None in a ``PCMD``.
@@ -51,7 +51,7 @@ class Progress:
         return all(math.isfinite(value) for value in values)
 
 
-NO_PROGRESS: Final = Progress(0, 0.0, 0.0, 0.0, 0.0)
+NO_PROGRESS: Final = ProgressCommand(0, 0.0, 0.0, 0.0, 0.0)
 
 
 def limits_of(configuration: Configuration) -> Limits:
@@ -66,7 +66,7 @@ def limits_of(configuration: Configuration) -> Limits:
 
 
 def set_point(
-    progress: Progress, configuration: Configuration, *, yaw_rad: float, forward_m_s: float
+    progress: ProgressCommand, configuration: Configuration, *, yaw_rad: float, forward_m_s: float
 ) -> Attitude | Hover:
     """Return the set-point that a ``PCMD`` requests, within the configured limits."""
     if not progress.flags & Pcmd.PROGRESSIVE:
@@ -97,7 +97,7 @@ CALIBRATION_RATE_RAD_S: Final = 1.5  #: yaw rate while calibrating, a full turn 
 _FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
 
 
-class FlightControl:
+class ArdroneFlightControl:
     """Flies one drone. Times are on the caller's clock [ns]."""
 
     def __init__(self, vehicle: Vehicle, configuration: Configuration, *, version: int) -> None:
@@ -131,7 +131,7 @@ class FlightControl:
         elif not self.start and state in (FlightState.TAKING_OFF, *_FLYING):
             self._vehicle.command(Land())
 
-    def follow(self, progress: Progress, now_ns: int) -> None:
+    def follow(self, progress: ProgressCommand, now_ns: int) -> None:
         """Handle ``PCMD`` or ``PCMD_MAG``; ignore it if a number is not finite.
 
         Unless the drone is hovering or flying, and during a magnetometer calibration, the command is only stored.

@@ -13,7 +13,7 @@ from typing import Final
 from skyloop.clock import Clock, nanoseconds, seconds
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.vehicles.ardrone.emulator.configuration import Configuration, Ids
-from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, FlightControl, Progress, limits_of
+from skyloop.vehicles.ardrone.emulator.flight import LOST_AFTER_S, ArdroneFlightControl, ProgressCommand, limits_of
 from skyloop.vehicles.ardrone.wire.at import SILENCE_RESET_S, AtCommand, Ctrl, parse_commands, to_float
 from skyloop.vehicles.ardrone.wire.configuration import VideoChannel, VideoCodec
 from skyloop.vehicles.ardrone.wire.navdata import State
@@ -100,7 +100,7 @@ class ArdroneLogic:
         self.lost = False  #: whether the link counts as lost after a long time without commands
         self._ids: Ids | None = None  # ids received with the previous command
         self.configuration = Configuration(version)
-        self.flight = FlightControl(vehicle, self.configuration, version=version)
+        self.flight = ArdroneFlightControl(vehicle, self.configuration, version=version)
         self.bootstrap = True  #: whether the drone sends no options yet, until its mode is configured
         self.leds: tuple[int, float, int] | None = None  #: number, frequency [Hz] and duration [s] last requested
         self.malformed = 0  #: number of invalid lines, unknown commands and wrong arguments
@@ -210,12 +210,12 @@ class ArdroneLogic:
 
     def _pcmd(self, flags: int, *values: int) -> None:
         roll, pitch, gaz, yaw = map(to_float, values)
-        self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw), self._clock())
+        self.flight.follow(ProgressCommand(int(flags), roll, pitch, gaz, yaw), self._clock())
 
     def _pcmd_mag(self, version: int, flags: int, *values: int) -> None:
         roll, pitch, gaz, yaw, heading, _accuracy = map(to_float, values)
         if version > 1:
-            self.flight.follow(Progress(int(flags), roll, pitch, gaz, yaw, heading), self._clock())
+            self.flight.follow(ProgressCommand(int(flags), roll, pitch, gaz, yaw, heading), self._clock())
 
     def _comwdg(self, *_: int | str) -> None:
         self._watchdog = False

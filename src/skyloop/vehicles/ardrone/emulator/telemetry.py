@@ -15,7 +15,7 @@ from typing import Final
 from skyloop.messages import FlightState
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
-from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, Progress
+from skyloop.vehicles.ardrone.emulator.flight import NO_PROGRESS, ProgressCommand
 from skyloop.vehicles.ardrone.wire import navdata as o
 from skyloop.vehicles.ardrone.wire.configuration import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.vehicles.ardrone.wire.navdata import ControlState
@@ -38,7 +38,7 @@ _CONTROL_STATES: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class ArdroneSnapshot:
     """The inputs from which all options are made."""
 
     believed: VehicleFeedback
@@ -47,7 +47,7 @@ class Snapshot:
     thrust: float = 0.0  #: multiple of the weight
     most_thrust: float = 1.9
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that are reported as level
-    progress: Progress = NO_PROGRESS
+    progress: ProgressCommand = NO_PROGRESS
     flipping: bool = False
     video: VideoStatus = NOTHING_SENT
     channel: VideoChannel = VideoChannel.FRONT
@@ -85,7 +85,7 @@ class Snapshot:
         return self.believed.altitude_m * 1000
 
 
-def options_of(snapshot: Snapshot, tags: list[int]) -> list[o.Option]:
+def options_of(snapshot: ArdroneSnapshot, tags: list[int]) -> list[o.Option]:
     """Return the options with these tags, in the order of the tags given."""
     return [_MAKERS[tag](snapshot) for tag in tags]
 
@@ -104,7 +104,7 @@ def tags_of(mask: int, *, demo: bool, version: int) -> list[int]:
     return [tag for tag in range(last + 1) if mask >> tag & 1]
 
 
-def _demo(s: Snapshot) -> o.Option:
+def _demo(s: ArdroneSnapshot) -> o.Option:
     vx, vy, _ = s.velocity_mm_s  # real drones always report vz as 0
     state = ControlState.LOOPING if s.flipping and s.state.airborne else _CONTROL_STATES[s.state]
     return o.Demo(
@@ -121,17 +121,17 @@ def _demo(s: Snapshot) -> o.Option:
     )
 
 
-def _accelerations_mg(s: Snapshot) -> tuple[float, float, float]:
+def _accelerations_mg(s: ArdroneSnapshot) -> tuple[float, float, float]:
     x, y, z = s.believed.acceleration_m_s2
     return x / GRAVITY_M_S2 * 1000, -y / GRAVITY_M_S2 * 1000, -z / GRAVITY_M_S2 * 1000
 
 
-def _rates_deg_s(s: Snapshot) -> tuple[float, float, float]:
+def _rates_deg_s(s: ArdroneSnapshot) -> tuple[float, float, float]:
     x, y, z = s.believed.angular_velocity_rad_s
     return math.degrees(x), -math.degrees(y), -math.degrees(z)
 
 
-def _raw(s: Snapshot) -> o.Option:
+def _raw(s: ArdroneSnapshot) -> o.Option:
     """Return the raw measurements. The converters' scales are estimates, but programs read the battery voltage here."""
     return o.RawMeasures(
         accs=tuple(_within(2048 + mg * 0.512, 0, 4095) for mg in _accelerations_mg(s)),
@@ -142,18 +142,18 @@ def _raw(s: Snapshot) -> o.Option:
     )
 
 
-def _physical(s: Snapshot) -> o.Option:
+def _physical(s: ArdroneSnapshot) -> o.Option:
     return o.PhysMeasures(acc_temp=45.0, gyro_temp=0, accs=_accelerations_mg(s), gyros=_rates_deg_s(s), alim_3v3=3300)
 
 
-def _euler_angles(s: Snapshot) -> o.Option:
+def _euler_angles(s: ArdroneSnapshot) -> o.Option:
     """Return the attitude computed from the accelerometers alone, which is correct only without acceleration."""
     x, y, z = s.believed.acceleration_m_s2
     theta = math.degrees(math.atan2(x, math.hypot(y, z)))
     return o.EulerAngles(theta * 1000, -math.degrees(math.atan2(y, abs(z))) * 1000)
 
 
-def _rc_references(s: Snapshot) -> o.Option:
+def _rc_references(s: ArdroneSnapshot) -> o.Option:
     pitch, roll, yaw, gaz = (
         _within(value * 1000, -32768, 32767)
         for value in (s.progress.pitch, s.progress.roll, s.progress.yaw, s.progress.gaz)
@@ -161,13 +161,13 @@ def _rc_references(s: Snapshot) -> o.Option:
     return o.RcReferences(pitch, roll, yaw, gaz, s.progress.flags & 1)
 
 
-def _pwm(s: Snapshot) -> o.Option:
+def _pwm(s: ArdroneSnapshot) -> o.Option:
     """Return motor values proportional to thrust, the same for all motors."""
     motor = _within(255 * s.thrust / s.most_thrust, 0, 255)
     return o.Pwm(motors=(motor,) * 4, saturations=(255 if motor else 0,) * 4, vz_ref=s.progress.gaz)
 
 
-def _altitude(s: Snapshot) -> o.Option:
+def _altitude(s: ArdroneSnapshot) -> o.Option:
     mm = s.altitude_mm
     return o.Altitude(
         vision=round(mm),
@@ -179,7 +179,7 @@ def _altitude(s: Snapshot) -> o.Option:
     )
 
 
-def _vision(s: Snapshot) -> o.Option:
+def _vision(s: ArdroneSnapshot) -> o.Option:
     return o.Vision(
         theta_capture=math.radians(s.theta_mdeg / 1000),
         phi_capture=math.radians(s.phi_mdeg / 1000),
@@ -190,7 +190,7 @@ def _vision(s: Snapshot) -> o.Option:
     )
 
 
-def _video_stream(s: Snapshot) -> o.Option:
+def _video_stream(s: ArdroneSnapshot) -> o.Option:
     return o.VideoStream(
         frame_size=s.video.bytes_last & 0xFFFFFFFF,
         frame_number=s.video.pictures & 0xFFFFFFFF,
@@ -199,12 +199,12 @@ def _video_stream(s: Snapshot) -> o.Option:
     )
 
 
-def _pressure_raw(s: Snapshot) -> o.Option:
+def _pressure_raw(s: ArdroneSnapshot) -> o.Option:
     pressure = STANDARD_PRESSURE_PA - PRESSURE_PA_PER_M * s.believed.altitude_m
     return o.PressureRaw(temperature=TEMPERATURE_DECI_C, pressure=round(pressure))
 
 
-def _magneto(s: Snapshot) -> o.Option:
+def _magneto(s: ArdroneSnapshot) -> o.Option:
     heading = math.radians(s.heading_deg)
     level, down = FIELD_MG
     field = (level * math.cos(heading), -level * math.sin(heading), down)
@@ -221,13 +221,13 @@ def _magneto(s: Snapshot) -> o.Option:
     )
 
 
-def _zero(kind: Callable[[], o.Option]) -> Callable[[Snapshot], o.Option]:
+def _zero(kind: Callable[[], o.Option]) -> Callable[[ArdroneSnapshot], o.Option]:
     option = kind()
     return lambda _: option
 
 
 #: Functions that make the options, keyed by tag. Options without any values to report are all zero, and 27 is ``Gps``.
-_MAKERS: Final[dict[int, Callable[[Snapshot], o.Option]]] = {
+_MAKERS: Final[dict[int, Callable[[ArdroneSnapshot], o.Option]]] = {
     **{layout.tag: _zero(kind) for kind, layout in o.LAYOUTS.items()},
     0: _demo,
     1: lambda s: o.Time(s.time),

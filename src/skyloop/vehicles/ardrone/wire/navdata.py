@@ -91,7 +91,7 @@ Ints: TypeAlias = tuple[int, ...]
 Option: TypeAlias = Any  #: one of the named tuples below
 
 
-class Layout:
+class OptionLayout:
     """The memory layout of an option: a struct format with one word per field (``3f`` is one field of three floats)."""
 
     def __init__(self, tag: int, kind: type[Any], words: list[str]) -> None:
@@ -128,8 +128,8 @@ def _count(word: str) -> int:
     return int(word[:-1] or 1)
 
 
-LAYOUTS: Final[dict[type[Any], Layout]] = {}  #: layout of each structure
-BY_TAG_AND_SIZE: Final[dict[tuple[int, int], Layout]] = {}  #: keyed by tag and size; the size excludes those two fields
+LAYOUTS: Final[dict[type[Any], OptionLayout]] = {}  #: layout of each structure
+BY_TAG_AND_SIZE: Final[dict[tuple[int, int], OptionLayout]] = {}  #: by tag and size; the size excludes those two fields
 
 _Kind = TypeVar("_Kind", bound=type[Any])
 
@@ -138,7 +138,7 @@ def _option(tag: int, form: str) -> Callable[[_Kind], _Kind]:
     """Register a class for an option whose fields the driver reads. Using a class lets their types be checked."""
 
     def register(kind: _Kind) -> _Kind:
-        layout = Layout(tag, kind, form.split())
+        layout = OptionLayout(tag, kind, form.split())
         LAYOUTS[kind] = BY_TAG_AND_SIZE[tag, layout.size] = layout
         return kind
 

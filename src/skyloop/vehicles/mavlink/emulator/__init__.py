@@ -30,19 +30,19 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.vehicles.emulation.emulator import NO_FAULTS, Emulator, Loop, RunningEmulator, checked_delay
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 from skyloop.vehicles.emulation.video import GROUP, OneCamera, VideoEncoding
-from skyloop.vehicles.mavlink.emulator.arducopter import ArduCopter
-from skyloop.vehicles.mavlink.emulator.autopilot import Autopilot
+from skyloop.vehicles.mavlink.emulator.arducopter import EmulatedArduCopter
+from skyloop.vehicles.mavlink.emulator.autopilot import EmulatedAutopilot
 from skyloop.vehicles.mavlink.emulator.links import (
     Kind,
+    LinkIntervals,
+    MavlinkSettings,
     Port,
     Ports,
-    Settings,
-    Streams,
     TcpPort,
     UdpPort,
     with_multirotors,
 )
-from skyloop.vehicles.mavlink.emulator.px4 import Px4
+from skyloop.vehicles.mavlink.emulator.px4 import EmulatedPx4
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -51,22 +51,22 @@ if TYPE_CHECKING:
 __all__ = ["Faults", "Kind", "MavlinkFirmware", "Ports", "with_multirotors"]
 
 
-_KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
+_KINDS: dict[Kind, type[EmulatedAutopilot]] = {Kind.ARDUCOPTER: EmulatedArduCopter, Kind.PX4: EmulatedPx4}
 
 
 class RunningFirmware(RunningEmulator):
     """An autopilot that is switched on. Use it only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: MavlinkSettings, loop: Loop | None) -> None:
         super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
         try:
-            udp = UdpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
+            udp = UdpPort(self._loop, settings, LinkIntervals(kind.RATES), self._on_message)
             self._open.append(udp)
             tcp = None
             if settings.ports.tcp is not None:
-                tcp = TcpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
+                tcp = TcpPort(self._loop, settings, LinkIntervals(kind.RATES), self._on_message)
                 self._open.append(tcp)
             self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
             self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)
@@ -149,7 +149,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         self._loop = loop
         delay_s = checked_delay(delay_s)
         ports = ports or Ports.standard(kind, drone)
-        self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
+        self.settings = MavlinkSettings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
@@ -157,7 +157,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         return running
 
     @property
-    def autopilot(self) -> Autopilot:
+    def autopilot(self) -> EmulatedAutopilot:
         """The running autopilot, for tests. Use it only on the loop's thread."""
         return self._started.autopilot
 

@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 from skyloop.messages.geometry import turned, wrap_angle
 from skyloop.vehicles.emulation.flight import GO_M_S, SINK_M_S, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, EmulatedAutopilot, MavResult, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -26,8 +26,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import Mission, MissionResult, ParameterTable, mission_ack
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, Message
-from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import COPTER_MODES, COPTER_NUMBERS, MavAutopilot, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_WITHOUT_STICKS_M_S: Final = -2.5  #: climb rate in stick modes if there is no remote control
@@ -45,10 +44,10 @@ _NOT_ARMABLE: Final = ("LAND", "BRAKE", "AUTO", "RTL")
 _PILOT: Final = ("LOITER", "ALT_HOLD", "STABILIZE", "POSHOLD")
 
 
-class ArduCopter(Autopilot):
+class EmulatedArduCopter(EmulatedAutopilot):
     """An emulated ArduCopter."""
 
-    AUTOPILOT = Number.ARDUPILOT
+    AUTOPILOT = MavAutopilot.ARDUPILOT
     CAPABILITIES = 0xFBEF & ~0xD200  # excluding fences, rally points, terrain and files, which are not emulated
     VERSION = 4 << 24 | 7 << 16
     RATES: ClassVar[dict[int, float]] = {m.MAVLINK_MSG_ID_HEARTBEAT: 1.0, m.MAVLINK_MSG_ID_TIMESYNC: 0.2}
@@ -56,7 +55,7 @@ class ArduCopter(Autopilot):
     ABOVE_SEA = frozenset({0, 5})
     ABOVE_HOME = frozenset({3, 6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_SET_HOME: 0}
-    NOT_PROVIDED = Result.FAILED
+    NOT_PROVIDED = MavResult.FAILED
     BYTEWISE = False
     DISARM_S = 10.2
     WORDS: ClassVar[dict[str, str]] = {
@@ -195,18 +194,18 @@ class ArduCopter(Autopilot):
         mode = COPTER_MODES.get(number)
         if mode is None:
             self.send_text(f"No such mode {number}")
-            return Result.FAILED
+            return MavResult.FAILED
         needs_place = mode in ("GUIDED", "LOITER", "RTL", "BRAKE", "POSHOLD")
         if mode == "AUTO" or (needs_place and not self.has_origin):
             why = "init failed" if mode == "AUTO" else "requires position"
             self.send_text(f"Mode change to {mode} failed: {why}")
-            return Result.FAILED
+            return MavResult.FAILED
         self._set_mode(mode)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _go_by(self, manoeuvre: str) -> int:
         self._set_mode({"land": "LAND", "return": "RTL"}[manoeuvre])
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _disarmed(self) -> None:
         """Keep the mode, which is LAND after a landing and does not allow arming."""
@@ -217,25 +216,25 @@ class ArduCopter(Autopilot):
         if self.time_s < self._boot_s:
             self.send_text("Arm: Gyros inconsistent", CRITICAL)
             self.send_text("Arm: Need Position Estimate", CRITICAL)
-            return Result.FAILED
+            return MavResult.FAILED
         if self.mode in _NOT_ARMABLE:
             self.send_text(f"Arm: {self.mode} mode not armable", CRITICAL)
-            return Result.FAILED
+            return MavResult.FAILED
         if self.mode == "GUIDED" and not self.has_origin:
             self.send_text("Arm: Need Position Estimate", CRITICAL)
-            return Result.FAILED
+            return MavResult.FAILED
         return None
 
     def _refuse_disarming(self) -> int:
-        return Result.FAILED
+        return MavResult.FAILED
 
     def _take_off(self, arguments: Arguments) -> int:
         height = arguments[6]
         if self.mode != "GUIDED" or not self.armed or not self.flight.standing or not height > 0:
-            return Result.FAILED
+            return MavResult.FAILED
         self._manoeuvres.begin_rise(self.home[2] + height)
         self._rising, self._target = True, None
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     # Set-points ------------------------------------------------------------------------------------------------
 
@@ -279,41 +278,41 @@ class ArduCopter(Autopilot):
 
     def _reposition(self, arguments: Arguments, frame: int) -> int:
         if self.mode != "GUIDED" and not whole(arguments[1]) & 1:
-            return Result.DENIED
+            return MavResult.DENIED
         place = self._place(arguments, frame)
         if place is None or not _given(arguments):
-            return Result.DENIED
-        if self.mode != "GUIDED" and self._change_mode((1, COPTER_NUMBERS["GUIDED"])) != Result.ACCEPTED:
-            return Result.FAILED
+            return MavResult.DENIED
+        if self.mode != "GUIDED" and self._change_mode((1, COPTER_NUMBERS["GUIDED"])) != MavResult.ACCEPTED:
+            return MavResult.FAILED
         self._go_to(Target(place))
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _set_home(self, arguments: Arguments, frame: int) -> int:
         here = arguments[0] == 1 or not _given(arguments)
         if not self.has_origin or not (here or arguments[0] == 0):
-            return Result.FAILED
+            return MavResult.FAILED
         place = self.flight.place if here else self._place(arguments, frame)
         if place is None:
-            return Result.DENIED
+            return MavResult.DENIED
         self._home_at(place)
         for number in (m.MAVLINK_MSG_ID_HOME_POSITION, m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN):
             made = self._requested(number)
             for port in self.ports:
                 port.send(made)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
         which, speed = arguments[:2]
         if self.mode not in ("GUIDED", "RTL") or not 0 < speed < math.inf:
-            return Result.FAILED
+            return MavResult.FAILED
         changed = "down" if which > 2.9 else "up" if which > 1.9 else "across"
         self._speeds = replace(self._speeds, **{changed: speed})
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _condition_yaw(self, arguments: Arguments) -> int:
         angle, rate, way, relative = arguments[:4]
         if not 0 <= angle <= 360 or relative not in (0, 1):
-            return Result.FAILED
+            return MavResult.FAILED
         if relative:
             clockwise = math.radians(angle) * (1 if way >= 0 else -1)
         else:
@@ -323,31 +322,31 @@ class ArduCopter(Autopilot):
             elif clockwise < 0 < way:
                 clockwise += math.tau
         self._turn = Turn(self.flight, -clockwise, min(TURN_RAD_S, math.radians(rate)) if rate > 0 else TURN_RAD_S)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _pause_or_continue(self, arguments: Arguments) -> int:
         order = whole(arguments[0])
         if order not in (0, 1):
-            return Result.DENIED
+            return MavResult.DENIED
         if self.mode != "GUIDED":
             self.send_text(f"Failed to {'resume' if order else 'pause'}", INFO)
-            return Result.FAILED
+            return MavResult.FAILED
         self._paused = not order
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _send_banner(self, arguments: Arguments) -> int:  # noqa: ARG002  the command has no arguments
         major, minor = self.VERSION >> 24, self.VERSION >> 16 & 0xFF
         for text in (f"ArduCopter V{major}.{minor}.0-dev (emulated by Skyloop)", "Frame: QUAD/X"):
             self.send_text(text, INFO)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _reboot(self, arguments: Arguments) -> int:
         if self.armed or whole(arguments[0]) not in (1, 3):
-            return Result.FAILED
+            return MavResult.FAILED
         self._set_mode("STABILIZE")
         self._stick, self._overrides, self.failsafe = None, {}, False
         self._restart()  # keeps the mission and parameters
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     @property
     def channels(self) -> list[int] | None:

@@ -43,7 +43,7 @@ Handler = Callable[[Arguments], int]
 PlaceHandler = Callable[[Arguments, int], int]
 
 
-class Result(IntEnum):
+class MavResult(IntEnum):
     """Values of ``MAV_RESULT``."""
 
     ACCEPTED = 0
@@ -53,7 +53,7 @@ class Result(IntEnum):
     FAILED = 4
 
 
-class Autopilot(AutopilotState):
+class EmulatedAutopilot(AutopilotState):
     """One autopilot. Call all its methods on one thread. Set ``ports`` (its links) before the first report."""
 
     CAPABILITIES: ClassVar[int]
@@ -247,19 +247,19 @@ class Autopilot(AutopilotState):
             result = self._set_interval(port, whole(arguments[0]), arguments[1])
         elif number == m.MAV_CMD_GET_MESSAGE_INTERVAL:
             answer = self._interval(port, whole(arguments[0]))
-            result = Result.ACCEPTED if answer is not None else Result.FAILED
+            result = MavResult.ACCEPTED if answer is not None else MavResult.FAILED
         elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
             answer = self._requested(asked)
-            result = Result.ACCEPTED if answer is not None else self.NOT_PROVIDED
+            result = MavResult.ACCEPTED if answer is not None else self.NOT_PROVIDED
         elif number == m.MAV_CMD_GET_HOME_POSITION:
             answer = self._requested(m.MAVLINK_MSG_ID_HOME_POSITION)
-            result = Result.ACCEPTED if answer is not None else self.NOT_PROVIDED
+            result = MavResult.ACCEPTED if answer is not None else self.NOT_PROVIDED
         elif number in self._placed_commands:
-            result = Result.UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
+            result = MavResult.UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
         else:
             handler = self._commands.get(number)
-            result = Result.UNSUPPORTED if handler is None else handler(arguments)
+            result = MavResult.UNSUPPORTED if handler is None else handler(arguments)
         sender = message.get_srcSystem(), message.get_srcComponent()
         port.send(m.MAVLink_command_ack_message(number, result, 0, 0, *sender))
         if answer is not None:
@@ -282,23 +282,23 @@ class Autopilot(AutopilotState):
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
         if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # the comparison is also false for NaN
-            return Result.FAILED
+            return MavResult.FAILED
         port.streams.set_interval(number, interval_us)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _arm_or_disarm(self, arguments: Arguments) -> int:
         forced = whole(arguments[1]) == FORCE
         if arguments[0] >= 0.5:
-            return Result.ACCEPTED if self.armed else self._arm(forced)
+            return MavResult.ACCEPTED if self.armed else self._arm(forced)
         if not self.armed:
-            return Result.ACCEPTED
+            return MavResult.ACCEPTED
         if self.flight.standing:
             self._disarm("")
-            return Result.ACCEPTED
+            return MavResult.ACCEPTED
         if forced:
             self.flight.cut()
             self._disarm("")
-            return Result.ACCEPTED
+            return MavResult.ACCEPTED
         return self._refuse_disarming()
 
     def _arm(self, forced: bool) -> int:
@@ -309,7 +309,7 @@ class Autopilot(AutopilotState):
         if not self._home_given:
             self.home = self.flight.place
         self.send_text(self.WORDS["armed"], INFO)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _disarm(self, text: str) -> None:
         self.armed = False

@@ -14,7 +14,7 @@ from skyloop.errors import UsageError
 from skyloop.faults import Faults
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.emulation.emulator import Address, ByteServer, DatagramPort, Loop
-from skyloop.vehicles.mavlink.wire.codec import Codec, Message
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 
 REPORTS_HZ: Final = 125.0  #: rate at which a real-time world reports
 APART: Final = 10  #: difference between the port numbers of two drones
@@ -92,7 +92,7 @@ def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPO
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class MavlinkSettings:
     """The arguments passed to :class:`skyloop.vehicles.mavlink.emulator.MavlinkFirmware`."""
 
     kind: Kind
@@ -115,7 +115,7 @@ class Settings:
 MAX_INTERVAL_US: Final = 2**31 - 1  #: maximum value of the interval field in ``MESSAGE_INTERVAL``
 
 
-class Streams:
+class LinkIntervals:
     """The message intervals on one link. Times are on the autopilot's clock [s]."""
 
     def __init__(self, rates: Mapping[int, float]) -> None:
@@ -167,21 +167,21 @@ PEER_NS: Final = nanoseconds(3.0)  #: time without data after which a peer may b
 class Port(Protocol):
     """A link of the autopilot, with the message rates requested on it."""
 
-    streams: Streams
+    streams: LinkIntervals
 
     def send(self, message: Message) -> None: ...
 
     def close(self) -> None: ...
 
 
-def _codec(settings: Settings) -> Codec:
-    return Codec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
+def _codec(settings: MavlinkSettings) -> MavlinkCodec:
+    return MavlinkCodec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
 
 
 class UdpPort:
     """A UDP port that sends to the remote port until a message arrives, then to that message's sender."""
 
-    def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: LinkIntervals, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message
@@ -222,7 +222,7 @@ class UdpPort:
 class TcpPort:
     """A TCP server for one client at a time. The next client waits in the kernel's backlog, receiving nothing."""
 
-    def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
+    def __init__(self, loop: Loop, settings: MavlinkSettings, streams: LinkIntervals, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
         self._on_message = on_message

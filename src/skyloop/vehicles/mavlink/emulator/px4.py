@@ -7,7 +7,7 @@ from typing import ClassVar, Final
 
 from skyloop.vehicles.emulation.flight import USUAL, Speeds, Vehicle
 from skyloop.vehicles.mavlink.emulator import services
-from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, Autopilot, Result, whole
+from skyloop.vehicles.mavlink.emulator.autopilot import CRITICAL, INFO, Arguments, EmulatedAutopilot, MavResult, whole
 from skyloop.vehicles.mavlink.emulator.links import Port
 from skyloop.vehicles.mavlink.emulator.manoeuvres import (
     BODY,
@@ -22,8 +22,7 @@ from skyloop.vehicles.mavlink.emulator.manoeuvres import (
 )
 from skyloop.vehicles.mavlink.emulator.services import ParameterTable
 from skyloop.vehicles.mavlink.wire.axes import yaw_between
-from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, Message, px4_custom
-from skyloop.vehicles.mavlink.wire.codec import Autopilot as Number
+from skyloop.vehicles.mavlink.wire.codec import PX4_MODES, MavAutopilot, Message, px4_custom
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 
 SINK_IN_POSCTL_M_S: Final = -0.7  #: climb rate in stick modes if there is no remote control
@@ -34,10 +33,10 @@ LIFTS_OFF_AT: Final = 0.2  #: throttle at which the vehicle lifts off, as a frac
 _STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
 
 
-class Px4(Autopilot):
+class EmulatedPx4(EmulatedAutopilot):
     """An emulated PX4."""
 
-    AUTOPILOT = Number.PX4
+    AUTOPILOT = MavAutopilot.PX4
     CAPABILITIES = 0xE8FF & ~0xC025  # excluding files, missions, fences and rally points, which are not emulated
     VERSION = 1 << 24 | 17 << 16
     RATES: ClassVar[dict[int, float]] = {
@@ -63,7 +62,7 @@ class Px4(Autopilot):
     ABOVE_SEA = frozenset({5})
     ABOVE_HOME = frozenset({6})
     LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_REPOSITION: 5, m.MAV_CMD_DO_SET_HOME: 5}
-    NOT_PROVIDED = Result.DENIED
+    NOT_PROVIDED = MavResult.DENIED
     BYTEWISE = True
     DISARM_S = 11.1
     REPORTS_PREARM = False
@@ -201,7 +200,7 @@ class Px4(Autopilot):
         main, sub = whole(arguments[1]), whole(arguments[2]) if len(arguments) > 2 else 0
         mode = PX4_MODES.get((main, sub if main == 4 else 0))
         if mode is None or mode == "AUTO.READY":
-            return Result.ACCEPTED
+            return MavResult.ACCEPTED
         if mode == "OFFBOARD" and not self._fresh:
             self.send_text("Switching to Offboard is currently not available", CRITICAL)
         elif mode in _STICKS and self.armed and not self.remote:
@@ -212,11 +211,11 @@ class Px4(Autopilot):
             if mode == "AUTO.TAKEOFF":
                 self._manoeuvres.begin_rise(self.home[2] + self.parameters["MIS_TAKEOFF_ALT"])
             self._set_mode(mode)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _go_by(self, manoeuvre: str) -> int:
         self._set_mode({"land": "AUTO.LAND", "return": "AUTO.RTL"}[manoeuvre])
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _disarmed(self) -> None:
         if self.mode in ("AUTO.LAND", "AUTO.RTL", "AUTO.TAKEOFF"):
@@ -228,11 +227,11 @@ class Px4(Autopilot):
         if self.ready:
             return None
         self.send_text("Arming denied: Resolve system health failures first\t", CRITICAL)
-        return Result.TEMPORARILY_REJECTED
+        return MavResult.TEMPORARILY_REJECTED
 
     def _refuse_disarming(self) -> int:
         self.send_text("Disarming denied: not landed\t", CRITICAL)
-        return Result.TEMPORARILY_REJECTED
+        return MavResult.TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
         """Take off from the ground or in the air, whether or not the vehicle is armed."""
@@ -241,7 +240,7 @@ class Px4(Autopilot):
         height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
         self._manoeuvres.begin_rise(max(0.5, height))
         self._set_mode("AUTO.TAKEOFF")
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     # Set-points ------------------------------------------------------------------------------------------------
 
@@ -274,11 +273,11 @@ class Px4(Autopilot):
     def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  always above sea level
         """Enter HOLD at another position. While disarmed, this changes only the mode."""
         if whole(arguments[1]) != 1:
-            return Result.UNSUPPORTED
+            return MavResult.UNSUPPORTED
         fresh = self.mode != "AUTO.LOITER"
         self._set_mode("AUTO.LOITER")
         if not self.armed:
-            return Result.ACCEPTED
+            return MavResult.ACCEPTED
         speed = arguments[0]
         if speed > 0:
             self._speeds = Speeds(across=speed)
@@ -295,24 +294,24 @@ class Px4(Autopilot):
             up = altitude - ORIGIN.altitude_m
         yaw = yaw_between(arguments[3]) if math.isfinite(arguments[3]) else None
         self._waiting_at = Target((east, north, up), yaw=yaw)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  always above sea level
         if arguments[0] > 0.5:
             place = self.flight.place
         elif not all(map(math.isfinite, arguments[4:7])):
-            return Result.DENIED
+            return MavResult.DENIED
         else:
             place = place_of(arguments[4], arguments[5], arguments[6] - ORIGIN.altitude_m)
         if not self.has_origin:
-            return Result.TEMPORARILY_REJECTED
+            return MavResult.TEMPORARILY_REJECTED
         self._home_at(place)
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _change_speed(self, arguments: Arguments) -> int:
         """Change the speed. The command is accepted even if it has no effect."""
         self._speeds = Speeds(across=arguments[1]) if 0 < arguments[1] < math.inf else USUAL
-        return Result.ACCEPTED
+        return MavResult.ACCEPTED
 
     def _own(self, port: Port, message: Message) -> bool:
         if message.get_type() != "PING" or message.target_system or message.target_component:
@@ -402,5 +401,5 @@ class Px4(Autopilot):
 
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
         if number == m.MAVLINK_MSG_ID_HEARTBEAT:
-            return Result.FAILED
+            return MavResult.FAILED
         return super()._set_interval(port, number, interval_us)

@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("mavlink://", "mavlink", cause=str(error)) from error
 
-__all__ = ["KEY_BYTES", "MAX_FRAME", "Codec", "Message", "dialect"]
+__all__ = ["KEY_BYTES", "MAX_FRAME", "MavlinkCodec", "Message", "dialect"]
 
 #: A pymavlink message; its fields are attributes.
 Message: TypeAlias = Any
@@ -153,7 +153,7 @@ class _Signatures:
         return True
 
 
-class Codec:
+class MavlinkCodec:
     """One end of a link, with its sequence numbers, incomplete frames and signatures.
 
     With a 32-byte ``key``, everything sent is signed, and everything unsigned but RADIO_STATUS rejected (MAVLink 2).
@@ -359,7 +359,7 @@ def to_field(value: float, kind: int, *, bytewise: bool) -> float:
 # Modes ---------------------------------------------------------------------------------------------------------------
 
 
-class Autopilot(IntEnum):
+class MavAutopilot(IntEnum):
     """The supported ``MAV_AUTOPILOT`` values."""
 
     ARDUPILOT = 3

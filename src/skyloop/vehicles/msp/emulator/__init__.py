@@ -39,7 +39,7 @@ from skyloop.vehicles.msp.wire.firmwares import (
     rate_curve,
     share_of,
 )
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, Parser, encode
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, USUAL_MAP, Function, ModeRange, OnLoss, RxConfig
 
 __all__ = ["BetaflightFirmware", "BoardSettings", "with_racers"]
@@ -172,7 +172,7 @@ def bit(name: str) -> int:
     return 1 << (FLAGS - 1 if name == ARM_SWITCH else BETAFLIGHT_FLAGS.index(name))
 
 
-class Board:
+class EmulatedBoard:
     """One flight controller. Not thread-safe: use it only on the loop's thread.
 
     ``received`` holds the latest sticks in the order roll, pitch, yaw, throttle, AUX; ``frames`` counts stick frames.
@@ -203,16 +203,16 @@ class Board:
 
     # Frames --------------------------------------------------------------------------------------------------------
 
-    def answer(self, frame: Frame, now_ns: int) -> Frame | None:
+    def answer(self, frame: MspFrame, now_ns: int) -> MspFrame | None:
         """Handle a frame and return the reply."""
         if frame.direction is not Direction.REQUEST or self.silenced:
             return None
         payload = self._payload(frame, now_ns)
         if payload is None:
-            return Frame(frame.function, b"", Direction.ERROR)
-        return Frame(frame.function, payload, Direction.REPLY)
+            return MspFrame(frame.function, b"", Direction.ERROR)
+        return MspFrame(frame.function, payload, Direction.REPLY)
 
-    def _payload(self, frame: Frame, now_ns: int) -> bytes | None:
+    def _payload(self, frame: MspFrame, now_ns: int) -> bytes | None:
         if frame.function == Function.SET_RAW_RC:
             return self._take_sticks(msp.channels(frame.payload), now_ns)
         if frame.function == Function.MULTIPLE:
@@ -275,17 +275,17 @@ class Board:
 
     # State ---------------------------------------------------------------------------------------------------------
 
-    def _status(self, now_ns: int) -> msp.Status:
+    def _status(self, now_ns: int) -> msp.MspStatus:
         settings = self.settings
         has = msp.Sensor
         sensors = 1 << has.ACCELEROMETER | settings.barometer << has.BAROMETER | settings.gps << has.GPS
         modes = sum(1 << place for place, (number, _) in enumerate(BOXES) if number and self._is_on(number))
-        return msp.Status(sensors, modes | self.armed, self._hindrances(now_ns), FLAGS, 125, 12)
+        return msp.MspStatus(sensors, modes | self.armed, self._hindrances(now_ns), FLAGS, 125, 12)
 
-    def _attitude(self) -> msp.Attitude:
+    def _attitude(self) -> msp.MspAttitude:
         believed = self._seen.believed
         heading = 90.0 - math.degrees(believed.yaw_rad)
-        return msp.Attitude(math.degrees(believed.roll_rad), math.degrees(believed.pitch_rad), heading)
+        return msp.MspAttitude(math.degrees(believed.roll_rad), math.degrees(believed.pitch_rad), heading)
 
     def _altitude(self) -> msp.Altitude:
         believed = self._seen.believed
@@ -439,7 +439,7 @@ class RunningFirmware(RunningEmulator):
         self, host: SimHost, drone: int, bind: str, port: int, settings: BoardSettings, loop: Loop | None
     ) -> None:
         super().__init__(host, drone, loop or "skyloop-betaflight")
-        self.board = Board(SimulatedVehicle(host.simulation, drone), settings, monotonic_ns())
+        self.board = EmulatedBoard(SimulatedVehicle(host.simulation, drone), settings, monotonic_ns())
         self._parser = Parser()
         simulation = host.simulation
         first = Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns())
@@ -512,7 +512,7 @@ class BetaflightFirmware(Emulator[RunningFirmware]):
         return self._started.port
 
     @property
-    def board(self) -> Board:
+    def board(self) -> EmulatedBoard:
         """The running flight controller, for tests. Use it only on the loop's thread."""
         return self._started.board
 

@@ -30,7 +30,7 @@ _V2: Final = struct.Struct("<BHH")
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class MspFrame:
     function: int  #: 0 to 65535; 255 and greater only in version 2
     payload: bytes = b""  #: at most 65535 bytes
     direction: Direction = Direction.REQUEST
@@ -65,7 +65,7 @@ def xor(data: bytes) -> int:
     return made
 
 
-def encode(frame: Frame, *, version: int | None = None) -> bytes:
+def encode(frame: MspFrame, *, version: int | None = None) -> bytes:
     """Return a frame's bytes, by default in the lowest version that can represent it. Raises ``ValueError``."""
     function, payload = frame.function, frame.payload
     if not 0 <= function <= LARGEST or len(payload) > LARGEST:
@@ -110,10 +110,10 @@ class Parser:
         """Discard an incomplete frame, because the next bytes come from a new connection."""
         self._kept.clear()
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[MspFrame]:
         """Return the frames that these bytes complete."""
         self._kept += data
-        found: list[Frame] = []
+        found: list[MspFrame] = []
         at = 0
         while True:
             start = self._kept.find(b"$", at)
@@ -134,7 +134,7 @@ class Parser:
         del self._kept[:at]
         return found
 
-    def _frame(self, at: int, found: list[Frame]) -> int:
+    def _frame(self, at: int, found: list[MspFrame]) -> int:
         """Return the length of the frame at this ``$``; 0 if the frame is incomplete, -1 if there is no frame."""
         kept = self._kept
         left = len(kept) - at
@@ -157,7 +157,7 @@ class Parser:
         if check != kept[at + length - 1]:
             self.damaged += 1
             return -1
-        found.append(Frame(function, bytes(kept[at + begin : at + begin + size]), direction))
+        found.append(MspFrame(function, bytes(kept[at + begin : at + begin + size]), direction))
         return length
 
     def _head(self, at: int, left: int) -> tuple[int, int, int] | None:

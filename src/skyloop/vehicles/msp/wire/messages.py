@@ -79,7 +79,7 @@ INAV: Final = "INAV"
 
 
 @dataclass(frozen=True, slots=True)
-class Identity:
+class MspIdentity:
     """A flight controller's identity."""
 
     variant: str = ""  #: four letters, such as :data:`BETAFLIGHT`
@@ -125,7 +125,7 @@ def board(payload: bytes) -> str:
 
 
 class Sensor(IntEnum):
-    """Bits of :attr:`Status.sensors`."""
+    """Bits of :attr:`MspStatus.sensors`."""
 
     ACCELEROMETER = 0
     BAROMETER = 1
@@ -135,7 +135,7 @@ class Sensor(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class MspStatus:
     """Active sensors and modes, and the flags that prevent arming."""
 
     sensors: int  #: bits of :class:`Sensor`
@@ -181,7 +181,7 @@ class Status:
 
 
 @dataclass(frozen=True, slots=True)
-class Attitude:
+class MspAttitude:
     """Roll (positive right side down), pitch (positive nose down) and heading (clockwise from north) [degrees]."""
 
     roll_deg: float
@@ -363,7 +363,7 @@ def pack_mode_ranges(ranges: Sequence[ModeRange], places: int = 20) -> bytes:
 
 
 def box_names(payload: bytes) -> list[str]:
-    """Return the names in ``BOXNAMES``, in the order of the bits in :attr:`Status.modes`."""
+    """Return the names in ``BOXNAMES``, in the order of the bits in :attr:`MspStatus.modes`."""
     return [name for name in text(payload, len(payload)).split(";") if name]
 
 

@@ -44,8 +44,8 @@ from skyloop.errors import DecodeError, UsageError
 from skyloop.sim.instruments import GpsFix, Readings, geodetic
 from skyloop.vehicles.mavlink.wire.axes import turned_axes
 from skyloop.vehicles.msp.wire.firmwares import flag_names
-from skyloop.vehicles.msp.wire.frames import Frame, Parser, encode
-from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, Status
+from skyloop.vehicles.msp.wire.frames import MspFrame, Parser, encode
+from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, MspStatus
 from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, SeparateNetwork, bound, release_instance, reserve_instance
@@ -68,7 +68,7 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class FlightState:
+class BetaflightState:
     """The state sent to Betaflight, in the axes of the packet."""
 
     time_s: float
@@ -80,7 +80,7 @@ class FlightState:
     pressure_pa: float
 
 
-def encode_state(state: FlightState) -> bytes:
+def encode_state(state: BetaflightState) -> bytes:
     """Encode a state as a packet."""
     return _STATE.pack(
         state.time_s,
@@ -93,10 +93,10 @@ def encode_state(state: FlightState) -> bytes:
     )
 
 
-def decode_state(packet: bytes) -> FlightState:
+def decode_state(packet: bytes) -> BetaflightState:
     """Decode a state. Raises :class:`DecodeError`."""
     n = _numbers(_STATE, packet, "state")
-    return FlightState(
+    return BetaflightState(
         n[0], _vector(n, 1), _vector(n, 4), (n[7], n[8], n[9], n[10]), _vector(n, 11), _vector(n, 14), n[17]
     )
 
@@ -252,7 +252,7 @@ class Betaflight(CoupledFirmware):
 
     def _verify(self) -> None:
         """Check that Betaflight replies on its serial port and that the flight control loop has run."""
-        with self._connected(encode(Frame(Function.API_VERSION)), b"$M>") as link:
+        with self._connected(encode(MspFrame(Function.API_VERSION)), b"$M>") as link:
             try:
                 _wait_for_flight_control(link)
             except (OSError, DecodeError) as error:
@@ -309,7 +309,7 @@ class Betaflight(CoupledFirmware):
             velocity = fix.velocity_m_s
         p, q, r = readings.gyro_rad_s
         fx, fy, fz = readings.acceleration_m_s2
-        state = FlightState(
+        state = BetaflightState(
             time_s=TIME_S,
             gyro_rad_s=(p, -q, -r),
             acceleration_m_s2=(-fx, -fy, -fz),
@@ -368,9 +368,9 @@ def _wait_for_flight_control(link: socket.socket) -> None:
     """Request the state until it confirms that flight control has run. Raises OSError if it never does."""
     parser, end_s = Parser(), time.monotonic() + FLIGHT_CONTROL_S
     while time.monotonic() < end_s:
-        link.sendall(encode(Frame(Function.STATUS_EX)))
+        link.sendall(encode(MspFrame(Function.STATUS_EX)))
         for frame in parser.feed(link.recv(MAX_TEXT)):
-            status = Status.of_betaflight(frame.payload)
+            status = MspStatus.of_betaflight(frame.payload)
             if "BOOTGRACE" not in flag_names(BETAFLIGHT, status.flags or 0, status.count):
                 return
         time.sleep(_PAUSE_S)

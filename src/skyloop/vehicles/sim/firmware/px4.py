@@ -23,7 +23,7 @@ from skyloop.platform import wait_readable
 from skyloop.sim.instruments import ALTITUDE_M, LATITUDE_DEG, LONGITUDE_DEG, GpsFix, Readings, geodetic
 from skyloop.sim.parameters import InstrumentParameters
 from skyloop.vehicles.mavlink.wire.axes import flip, swap, turned_axes
-from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, dialect
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import Commands, CoupledFirmware, FirmwareEvent, Launch, find_program
 
@@ -77,7 +77,7 @@ class Px4(CoupledFirmware):
     ) -> None:
         super().__init__(on_event, folder=folder)
         self._gps_delay_ms = round(instruments.gps_delay_s * 1000.0)
-        self._codec = Codec(_SYSTEM, _COMPONENT)
+        self._codec = MavlinkCodec(_SYSTEM, _COMPONENT)
         self._program = ""
         self._instance: int | None = None
         self._server: socket.socket | None = None
@@ -132,7 +132,7 @@ class Px4(CoupledFirmware):
 
     def _begin(self) -> None:
         self._hang_up()
-        self._codec = Codec(_SYSTEM, _COMPONENT)
+        self._codec = MavlinkCodec(_SYSTEM, _COMPONENT)
         self._backlog, self._step, self._sent, self._fix = b"", 0, 0, None
         self._own_us, self._wanted_us = STEP_US, 0
         self._inertial.clear()

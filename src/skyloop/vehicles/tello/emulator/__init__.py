@@ -45,7 +45,7 @@ from skyloop.vehicles.tello.emulator.logic import TelloLogic
 from skyloop.vehicles.tello.wire import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PADS, PORT, Sdk, pieces
 
 if TYPE_CHECKING:
-    from skyloop.sim.camera_pipeline import Camera
+    from skyloop.sim.camera_pipeline import PipelineCamera
 
 __all__ = ["Faults", "TelloFirmware", "with_tellos"]
 
@@ -100,7 +100,7 @@ def with_tellos(options: SimOptions | None = None) -> SimOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class TelloSettings:
     """The arguments passed to :class:`skyloop.vehicles.tello.emulator.TelloFirmware`."""
 
     sdk: Sdk
@@ -145,7 +145,7 @@ class TelloPacker:
 class RunningFirmware(RunningEmulator):
     """A Tello that is switched on. Use its logic and ports only on the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+    def __init__(self, host: SimHost, drone: int, settings: TelloSettings) -> None:
         super().__init__(host, drone, "skyloop-tello")
         self._settings = settings
         self._state_due_ns = 0
@@ -164,7 +164,7 @@ class RunningFirmware(RunningEmulator):
         self._packer = TelloPacker()
         self._shown = self._wanted_video()
         self._video = VideoEncoding(self._packer, lambda: self._shown, self._encoded)
-        self._cameras: tuple[Camera, ...] = ()
+        self._cameras: tuple[PipelineCamera, ...] = ()
         try:
             self._commands = self._datagrams("command", settings.port)
             self._video_port = self._datagrams("video", 0)
@@ -279,7 +279,7 @@ class TelloFirmware(Emulator[RunningFirmware]):
                 raise UsageError(f"mission pads are numbered from {PADS[0]} to {PADS[-1]}, got {number!r}")
         require_encoder("the video of an emulated Tello")
         super().__init__(host, drone)
-        self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
+        self.settings = TelloSettings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings)

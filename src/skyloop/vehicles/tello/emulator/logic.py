@@ -20,7 +20,7 @@ from skyloop.sim.world import Vec3
 from skyloop.vehicles.emulation.emulator import Address
 from skyloop.vehicles.emulation.flight import Vehicle
 from skyloop.vehicles.tello.emulator import telemetry
-from skyloop.vehicles.tello.emulator.telemetry import Sighting, seen
+from skyloop.vehicles.tello.emulator.telemetry import PadSighting, seen
 from skyloop.vehicles.tello.wire import (
     ENTER,
     FULL_CLIMB_M_S,
@@ -282,13 +282,13 @@ class TelloLogic:
         snapshot = self._snapshot()
         return None if snapshot is None else telemetry.state_string(snapshot, self._sdk)
 
-    def _snapshot(self) -> telemetry.Snapshot | None:
+    def _snapshot(self) -> telemetry.TelloSnapshot | None:
         if self._report is None or self._start is None:
             return None
         yaw_rad, altitude_m = self._start
-        return telemetry.Snapshot(self._report, yaw_rad, altitude_m, int(self._motor_s), self._pad())
+        return telemetry.TelloSnapshot(self._report, yaw_rad, altitude_m, int(self._motor_s), self._pad())
 
-    def _pad(self) -> Sighting | None:
+    def _pad(self) -> PadSighting | None:
         if not self.looks_for_pads or self._report is None:
             return None
         return seen(self._pads, self._report.truth)

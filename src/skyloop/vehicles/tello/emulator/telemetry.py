@@ -19,14 +19,14 @@ _VIEW: Final = 0.5  # horizontal reach of the downward camera as a fraction of t
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
+class PadSighting:
     """A pad below, and the drone's position above it in world axes; all pads are aligned with those axes."""
 
     number: int
     place_m: tuple[float, float, float]
 
 
-def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighting | None:
+def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> PadSighting | None:
     """Return the nearest pad in view; ``pads`` has x and y in world axes [m] by pad number."""
     x, y, z = truth.position_m
     if not LOWEST_M <= z <= HIGHEST_M:
@@ -36,7 +36,7 @@ def seen(pads: Mapping[int, tuple[float, float]], truth: VehicleTruth) -> Sighti
     if nearest is None or in_view[nearest] > _VIEW * z:
         return None
     east, north = pads[nearest]
-    return Sighting(nearest, (x - east, y - north, z))
+    return PadSighting(nearest, (x - east, y - north, z))
 
 
 FARTHEST_CM: Final = 400  #: range of the distance sensor; an estimate
@@ -45,17 +45,17 @@ BAROMETER_CM: Final = -6000  #: the barometer's reading at height 0, which is ar
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class TelloSnapshot:
     """The state at one instant."""
 
     report: Report
     start_yaw_rad: float  #: yaw when the drone was switched on
     start_altitude_m: float  #: altitude at take-off
     motor_s: int
-    pad: Sighting | None = None
+    pad: PadSighting | None = None
 
 
-def fields(snapshot: Snapshot) -> dict[str, str]:
+def fields(snapshot: TelloSnapshot) -> dict[str, str]:
     """Return all values as text, in the drone's own units and axes."""
     believed = snapshot.report.believed
     yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
@@ -85,13 +85,13 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
     }
 
 
-def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
+def state_string(snapshot: TelloSnapshot, sdk: Sdk) -> bytes:
     """Return the datagram with the state, which is sent ten times per second."""
     values = list(fields(snapshot).items())
     return build(values if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *values])
 
 
-def answer(question: str, snapshot: Snapshot) -> str:
+def answer(question: str, snapshot: TelloSnapshot) -> str:
     """Return the reply to a query about the state; raise ``KeyError`` for other queries."""
     values = fields(snapshot)
     answers = {
@@ -107,7 +107,7 @@ def answer(question: str, snapshot: Snapshot) -> str:
     return f"{answers[question]}\r\n"
 
 
-def _pad_fields(pad: Sighting | None) -> list[tuple[str, str]]:
+def _pad_fields(pad: PadSighting | None) -> list[tuple[str, str]]:
     if pad is None:
         numbers = (NO_PAD, NOWHERE_CM, NOWHERE_CM, NOWHERE_CM)
     else:

@@ -23,10 +23,10 @@ link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 place, port = options.serial0.removeprefix("udpclient:").split(":")
 rotors = (0, 0, 0, 0) if manner == "mavlink" else (1100, 1200, 1300, 1400)
 if manner == "mavlink":
-    from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
+    from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, dialect
 
     telemetry = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    codec = Codec(int(options.sysid), 1)
+    codec = MavlinkCodec(int(options.sysid), 1)
 with Path("states.jsonl").open("a", buffering=1) as states:
     for frame in range(1_000_000):
         if manner == "garbage":

@@ -12,12 +12,12 @@ import threading
 import time
 from pathlib import Path
 
-from skyloop.vehicles.msp.wire.frames import Direction, Frame, encode
-from skyloop.vehicles.msp.wire.messages import Function, Status
+from skyloop.vehicles.msp.wire.frames import Direction, MspFrame, encode
+from skyloop.vehicles.msp.wire.messages import Function, MspStatus
 from skyloop.vehicles.sim.firmware.betaflight import decode_state, encode_motors
 
-API_VERSION = encode(Frame(Function.API_VERSION))
-STATUS = encode(Frame(Function.STATUS_EX))
+API_VERSION = encode(MspFrame(Function.API_VERSION))
+STATUS = encode(MspFrame(Function.STATUS_EX))
 BOOTGRACE = 1 << 9
 
 assert sys.argv[1] == "127.0.0.1"
@@ -34,9 +34,9 @@ def command_line() -> None:
             if data == b"#":
                 link.sendall(b"Entering CLI Mode\r\n\r\n# ")
             elif data == API_VERSION:
-                link.sendall(encode(Frame(Function.API_VERSION, b"\0\1\57", Direction.REPLY)))
+                link.sendall(encode(MspFrame(Function.API_VERSION, b"\0\1\57", Direction.REPLY)))
             elif data == STATUS:
-                link.sendall(encode(Frame(Function.STATUS_EX, status.betaflight(), Direction.REPLY)))
+                link.sendall(encode(MspFrame(Function.STATUS_EX, status.betaflight(), Direction.REPLY)))
             elif data == b"save\r\n":
                 Path("eeprom.bin").write_bytes(text)
                 os._exit(0)
@@ -49,10 +49,10 @@ for deaf in Path(os.environ.get("STANDIN_DEAF", os.devnull)).glob("*"):
     deaf.unlink()
     deaf_server = socket.create_server(("127.0.0.1", msp_port))
     time.sleep(600)
-status = Status(0, 0, flags=0, count=29)
+status = MspStatus(0, 0, flags=0, count=29)
 for hangs in Path(os.environ.get("STANDIN_HANGS", os.devnull)).glob("*"):
     hangs.unlink()
-    status = Status(0, 0, flags=BOOTGRACE, count=29)
+    status = MspStatus(0, 0, flags=BOOTGRACE, count=29)
     break
 threading.Thread(target=command_line, daemon=True).start()
 link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from skyloop.vehicles.mavlink.wire.codec import Codec, dialect
+from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, dialect
 
 instance = int(sys.argv[sys.argv.index("-i") + 1])
 files = Path(sys.argv[sys.argv.index("-d") + 1])
@@ -18,7 +18,7 @@ assert (files / "init.d-posix").is_dir()
 assert os.environ["PX4_SIM_MODEL"] == "none_iris"
 given = sorted(f"{name}={value}\n" for name, value in os.environ.items() if name.startswith("PX4_PARAM_"))
 Path("parameters.txt").write_text("".join(given))
-codec = Codec(1, 1)
+codec = MavlinkCodec(1, 1)
 while True:
     try:
         link = socket.create_connection(("127.0.0.1", int(os.environ["STANDIN_PORT"]) + instance))
