@@ -225,6 +225,8 @@ def test_without_descriptors_the_control_socket_uses_little_cpu() -> None:
 
         def hang_up(self) -> None: ...
 
+        def release(self) -> None: ...
+
     server, full = ControlServer("full", lambda _: HostAnswer()), Full()
     server._listener = full  # type: ignore[assignment]
     thread = threading.Thread(target=server._run, args=(full,))

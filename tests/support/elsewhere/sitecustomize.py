@@ -18,6 +18,7 @@ import importlib.machinery
 import itertools
 import mmap
 import os
+import re
 import select
 import selectors
 import signal
@@ -249,8 +250,8 @@ class _WindowsThread(threading.Thread):
             super().join(timeout)
 
 
-def _key_pressed() -> bool:
-    """Return whether a key waits to be read, in a terminal that sends each one at once."""
+def _wait_for_console(_: Any, wait_ms: int) -> int:
+    """Wait for a key in the terminal, which sends each one at once from here on."""
     import termios
     import tty
 
@@ -258,7 +259,18 @@ def _key_pressed() -> bool:
         tty.setcbreak(0, termios.TCSANOW)
     poll = select.poll()
     poll.register(0, select.POLLIN)
-    return bool(poll.poll(0))
+    return 0 if poll.poll(wait_ms) else 0x102
+
+
+def _read_console(_: Any, records: Any, most: int, count: Any) -> int:
+    """Turn what the terminal sends into records of pressed keys."""
+    keys = re.findall(r"\x1b\[[A-D]|.", os.read(0, most).decode(errors="replace"), re.DOTALL)
+    for record, key in zip(records, keys, strict=False):
+        record.kind, record.down, record.key, record.character = 1, 1, 0, ord(key[-1])
+        if len(key) > 1:
+            record.key, record.character = {"A": 0x26, "B": 0x28, "C": 0x27, "D": 0x25}[key[-1]], 0
+    count._obj.value = len(keys)
+    return 1
 
 
 def _kill(pid: int, number: int) -> None:
@@ -294,10 +306,12 @@ def _windows() -> dict[str, types.ModuleType]:
         GetCurrentProcess=lambda: 0,
         SetThreadPriority=lambda *_: 1,
         SetPriorityClass=lambda *_: 1,
+        GetStdHandle=lambda _: 1,
+        WaitForSingleObject=_wait_for_console,
+        ReadConsoleInputW=_read_console,
     )
     console = types.ModuleType("msvcrt")
     console.__dict__.update(LK_NBLCK=2, locking=_locking, get_osfhandle=lambda descriptor: descriptor)
-    console.__dict__.update(kbhit=_key_pressed, getwch=lambda: os.read(0, 1).decode("latin-1"))
     return {
         "msvcrt": console,
         "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
