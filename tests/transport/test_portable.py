@@ -1142,3 +1142,40 @@ def test_a_process_out_of_descriptors_does_not_settle_on_the_portable_side(monke
     finally:
         systems.cache_clear()
         assert list(systems()) == list(sides)
+
+
+def test_a_packet_sent_in_part_just_as_the_room_for_the_last_one_was_found_is_completed(
+    pair: Pair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The thread of the last packet marked both as complete, so the thread of the new one gave up after one try."""
+    here, there, _ = pair
+    monkeypatch.setattr(portable, "_REST_SLICE_MS", 1)
+    find_room = here._wait_and_send
+
+    def find_room_and_send_more() -> bool:
+        monkeypatch.setattr(here, "_wait_and_send", look)
+        complete = find_room()
+        while not here._rest:
+            here.send(bytes(MAX_PACKET))
+            sent.append(MAX_PACKET)
+        done.set()
+        return complete
+
+    def look() -> bool:
+        done.wait(10.0)
+        return find_room()
+
+    sent: list[int] = []
+    done = threading.Event()
+    monkeypatch.setattr(here, "_wait_and_send", find_room_and_send_more)
+    while not here._rest:
+        here.send(bytes(MAX_PACKET))
+        sent.append(MAX_PACKET)
+    first = len(sent)
+    for _ in range(first):
+        assert len(there.recv(MAX_PACKET)) == MAX_PACKET
+    assert done.wait(10.0)
+    time.sleep(0.1)  # many looks, at none of which there is room
+    there.limit_wait(10.0)
+    for _ in range(len(sent) - first):
+        assert len(there.recv(MAX_PACKET)) == MAX_PACKET

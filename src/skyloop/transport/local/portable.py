@@ -51,7 +51,7 @@ from skyloop.transport.local.system import (
 SUFFIXES: Final = {PROXY: ".port", HOST: ".hostport"}
 VERSION: Final = 1  #: of the registration and the handshake
 HANDSHAKE_S: Final = 2.0  #: time for both ends to prove that they know the secret
-MAX_STRANGERS: Final = 32  #: connections that have not done that yet; of more, the oldest is closed
+MAX_STRANGERS: Final = 32  #: maximum number of connections that have not proved it yet; one more closes the oldest
 _HOST: Final = "127.0.0.1"
 #: Sizes of both ends' buffers towards the server and the client. On Linux, 290 set-points wait for a stalled server and
 #: 200 packets of 300 bytes for a stalled client, as on the fast side. Larger packets are completed while it reads.
@@ -60,9 +60,9 @@ _TO_CLIENT: Final = 32_768
 _LENGTH: Final = 4  # bytes before each packet
 _LONGEST: Final = 1 << 16  # longest packet [bytes]; a host accepts longer ones than a proxy
 _SLICE_MS: Final = 500 if sys.platform == "win32" else -1  # longest wait at once: on Windows, a shutdown ends none
-_LOCKED_WITHIN_S: Final = 1.0  # how long others' looks at a new registration may delay its lock
+_LOCKED_WITHIN_S: Final = 1.0  # how long other processes that check a new registration may delay its lock
 _REST_S: Final = 1.0  # time for the rest of a packet after its sender has hung up
-_REST_SLICE_MS: Final = 250  # how often its thread looks whether it has
+_REST_SLICE_MS: Final = 250  # how often that packet's thread checks whether the sender has
 _SMALL: Final = 1024  # longest packet that may follow a rest
 _MOST_WAITING: Final = 128
 _MOST_SELECTED: Final = 512  # what Windows' select waits for
@@ -199,34 +199,41 @@ class StreamSocket:
 
     def _complete(self) -> None:
         """Send the rest of a packet as soon as there is room, and tell the server so, or end the connection."""
+        complete = False
         try:
-            self._wait_and_send()
+            complete = self._wait_and_send()
         except BaseException as error:
             self._break()
             if not isinstance(error, (OSError, ValueError)):  # the connection has ended, or was closed
                 raise
-        self._awaiting_room = False
+        if not complete:
+            self._awaiting_room = False
         if self._ended:
-            self._shut_down(socket.SHUT_RDWR)
+            if not self._awaiting_room:  # otherwise, another packet was sent in part, and its thread does this
+                self._shut_down(socket.SHUT_RDWR)
         elif (has_room := self._has_room) is not None:
             with suppress(OSError, ValueError):
                 has_room()
 
-    def _wait_and_send(self) -> None:
+    def _wait_and_send(self) -> bool:
+        """Send the rest; return False if the sender has hung up and there was no room for too long."""
         wait, deadline_s = _waiter(self._socket, to_send=True), math.inf
-        while self._awaiting_room and time.monotonic() < deadline_s:
+        while time.monotonic() < deadline_s:
             wait(_REST_SLICE_MS)
             with self._sending:
                 self._inside = True
                 try:
                     self._send_rest()
+                    # From here on, a packet that is sent in part has a thread of its own.
                     self._awaiting_room = False
+                    return True
                 except BlockingIOError:
                     pass
                 finally:
                     self._inside = False
             if self._ended:
                 deadline_s = min(deadline_s, time.monotonic() + _REST_S)
+        return False
 
     def send_descriptor(self, packet: bytes, descriptor: int) -> None:  # noqa: ARG002
         raise OSError(errno.EOPNOTSUPP, "TCP carries no descriptors")
@@ -567,7 +574,7 @@ class Gate:
         self._name = name
         self._strangers: dict[socket.socket, None] = {}  # oldest first
         self._meeting = threading.Lock()  # guards those
-        self._waiting: deque[StreamSocket | str] = deque()  # those who were let in, or why one was not
+        self._waiting: deque[StreamSocket | str] = deque()  # admitted connections, or the reason why one was refused
         self._ends = self._woken, self._bell = socket.socketpair()  # a byte for each of those
         self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
         self._bell.setblocking(False)
