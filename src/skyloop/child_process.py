@@ -1,7 +1,7 @@
 """Run child processes that end with their parent, and protect objects after a fork.
 
-A child's standard input is a pipe to which nothing is written. When the parent closes its end, or dies for any reason,
-the child reads the end of file (:func:`on_parent_end`) and exits, too.
+A child's standard input is a pipe to which nothing is written, except on Windows. When the parent closes its end, or
+dies for any reason, the child reads the end of file (:func:`on_parent_end`) and exits, too.
 
 A child made by ``os.fork`` is different: it has copies of its parent's objects but not its threads, and destroying the
 copies would destroy resources that the parent still uses (:func:`leave_to_parent`).

@@ -202,7 +202,7 @@ def own_uid() -> int:
 
 
 def is_own_user(user: int | None, *, or_root: bool = False) -> bool:
-    """Return whether a user id is this process's own. Windows has no such ids: there, no one is anyone."""
+    """Return whether a user id is this process's own; always False on Windows, which has no such ids."""
     return sys.platform != "win32" and (user == own_uid() or (or_root and user == 0))
 
 
@@ -259,7 +259,7 @@ def _console_keys(within_s: float) -> bytes | None:
 
     learn.microsoft.com/windows/console/readconsoleinput describes them. ``msvcrt.getwch`` would not do: it announces an
     arrow by the character ``à``, which French keyboards have as a key, and then waits for another one. Ctrl-C
-    interrupts the program as usual, and is no record.
+    interrupts the program as usual and is not reported as a record.
     """
     import ctypes
 
@@ -268,12 +268,12 @@ def _console_keys(within_s: float) -> bytes | None:
     kernel32 = ctypes.WinDLL("kernel32")
     kernel32.GetStdHandle.restype = ctypes.c_void_p
     console, count = ctypes.c_void_p(kernel32.GetStdHandle(_STD_INPUT_HANDLE)), ctypes.c_ulong()
+    records = (_input_record() * 64)()
     deadline_s, keys = time.monotonic() + within_s, b""
     while not keys:  # records of other kinds wake this, too: of the mouse, of keys that are released
         left_ms = max(0, math.ceil((deadline_s - time.monotonic()) * 1e3))
         if kernel32.WaitForSingleObject(console, left_ms) != 0:
             return None
-        records = (_input_record() * 64)()
         kernel32.ReadConsoleInputW(console, records, len(records), ctypes.byref(count))
         for record in records[: count.value]:
             if record.kind == _KEY_EVENT and record.down:
