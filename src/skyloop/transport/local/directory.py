@@ -210,7 +210,8 @@ class Directory:
         try:
             if sys.platform != "win32" and path is not self.path and own_uid() == 0:
                 os.fchown(descriptor, here.st_uid, -1)  # root may have created it in another user's directory
-            _lock(descriptor, path, timeout_s)
+            if not lock_file(descriptor, timeout_s):
+                raise LinkError(f"{path} is locked by another process, which appears to be stopped")
             yield
         finally:
             os.close(descriptor)
@@ -280,8 +281,3 @@ def directory_owner(path: Path) -> int | None:
         with contextlib.suppress(OSError):
             return folder.lstat().st_uid
     return None
-
-
-def _lock(descriptor: int, path: Path, timeout_s: float) -> None:
-    if not lock_file(descriptor, timeout_s):
-        raise LinkError(f"{path} is locked by another process, which appears to be stopped")
