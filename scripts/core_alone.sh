@@ -21,10 +21,10 @@ rm "$copy"/tests/proxy/test_{safety,h264_encoder,stream_rate}.py
 if ! [[ -e $copy/venv/installed && $copy/venv/installed -nt pyproject.toml ]]; then
   "${PYTHON:-python3}" -m venv "$copy/venv"
   "$copy/venv/bin/python" -m pip install --quiet --disable-pip-version-check --editable "$copy" \
-    pytest pytest-timeout pytest-xdist hypothesis
+    pytest pytest-cov pytest-timeout pytest-xdist hypothesis
   touch "$copy/venv/installed"
 fi
 cd "$copy"
 venv/bin/python -m pytest -m 'not process' "$@" && exit
 echo "UNSTABLE OR BROKEN, run again one by one:" # a machine that was held up fails no test then, what is broken does
-venv/bin/python -m pytest -m 'not process' "$@" --numprocesses 0 --last-failed --last-failed-no-failures none
+venv/bin/python -m pytest -m 'not process' "$@" --numprocesses 0 --cov-append --last-failed --last-failed-no-failures none
