@@ -120,11 +120,15 @@ def _in_use(link: str) -> int | None:
     return None
 
 
-def _open_as(link: str) -> Iterator[Path]:
-    for path in Path("/proc").glob("[0-9]*/fd/*"):
-        with contextlib.suppress(OSError):
-            if str(path.readlink()) == link:
-                yield path
+def _open_as(link: str) -> list[str]:
+    found = []
+    for process in os.scandir("/proc"):
+        with contextlib.suppress(OSError):  # no process, or one that ends
+            for file in os.scandir(f"{process.path}/fd"):
+                with contextlib.suppress(OSError):
+                    if os.readlink(file) == link:  # noqa: PTH115  (``Path.readlink`` takes several times longer)
+                        found.append(file.path)
+    return found
 
 
 class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
@@ -154,7 +158,7 @@ class _WindowsPopen(subprocess.Popen):  # type: ignore[type-arg]
 
 def _is_open(path: Any) -> bool:
     """Return whether any process has this file open. Python opens files on Windows so that no one can remove them."""
-    return next(_open_as(os.path.realpath(path)), None) is not None
+    return bool(_open_as(os.path.realpath(path)))
 
 
 def _keep_open_files() -> None:
