@@ -180,6 +180,22 @@ def _keep_open_files() -> None:
         setattr(owner, name, guarded(owner, name))
 
 
+_EXCLUSIVE = ~4  # ``SO_EXCLUSIVEADDRUSE``
+
+
+def _share_no_ports() -> None:
+    """Let no listener of Skyloop share its port with other programs, as SO_REUSEADDR would."""
+    real = socket.socket.setsockopt
+
+    def setsockopt(sock: socket.socket, level: int, option: int, *value: Any) -> None:
+        if sys._getframe(1).f_globals.get("__name__", "").startswith("skyloop") and level == socket.SOL_SOCKET:
+            assert option != socket.SO_REUSEADDR, "on Windows, other programs could listen on the same port"
+            option = socket.SO_REUSEADDR if option == _EXCLUSIVE else option
+        real(sock, level, option, *value)
+
+    socket.socket.setsockopt = setsockopt  # type: ignore[assignment]
+
+
 def _only_sockets(*waited: Any) -> Any:
     """Wait as ``select.select`` does on Windows: for sockets, of which there must be one."""
     for each in (found := [*waited[0], *waited[1]]):
@@ -335,6 +351,7 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
     found["sys"] = _StandIn(sys, (), platform=system)
     if system == "win32":
         found |= _windows()
+        found["socket"].__dict__["SO_EXCLUSIVEADDRUSE"] = _EXCLUSIVE
         found["mmap"].__dict__["mmap"] = TaggedMemory
         found["select"].__dict__["select"] = _only_sockets
         found["time"].__dict__.update(_WINDOWS_CLOCKS)
@@ -382,3 +399,4 @@ if PRETEND:
     sys.meta_path.insert(0, _Finder(PRETEND))
     if PRETEND == "win32":
         _keep_open_files()
+        _share_no_ports()
