@@ -143,6 +143,7 @@ class FakeDrone:
         self.closed = False
         self._size = width, height
         self._seq = 0
+        self._shown_ns = 0
 
     def feedback(self, *, max_hz: float | None = None) -> Feedback:
         if self.newest is None:
@@ -195,7 +196,7 @@ class FakeDrone:
         width, height = self._size
         pixels = np.full((height, width, 3), shade, np.uint8) if image is None else image
         self._seq += 1
-        now = monotonic_ns()
+        now = self._shown_ns = max(monotonic_ns(), self._shown_ns + 1)  # no two within a step of a coarse clock
         header = FrameHeader(camera, self._seq, captured_ns or now, now, width, height, Encoding.BGR8, pixels.size)
         frame = ReceivedFrame(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
         for function in list(self.processors[camera]):
