@@ -6,6 +6,7 @@ import asyncio
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 import types
@@ -62,6 +63,18 @@ def test_a_session_is_ended_with_its_children(windows: Callable[..., None], monk
     monkeypatch.setattr(subprocess, "run", lambda command, **_: ran.append(command))
     platform.end_session(child)
     assert ran == [["taskkill", "/f", "/t", "/pid", str(child.pid)]]
+
+
+def test_a_listener_shares_its_port_with_no_program(
+    windows: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(socket, "SO_EXCLUSIVEADDRUSE", ~4, raising=False)
+    options: list[tuple[int, int, int]] = []
+    listener: Any = types.SimpleNamespace(setsockopt=lambda *values: options.append(values))
+    platform.claim_port(listener)
+    windows()
+    platform.claim_port(listener)
+    assert options == [(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1), (socket.SOL_SOCKET, ~4, 1)]
 
 
 @pytest.mark.parametrize("system", ["here", "windows"])

@@ -12,6 +12,7 @@ import math
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -156,6 +157,16 @@ def on_signals(numbers: Sequence[int], call: Callable[[], object]) -> None:
 def sees_peers() -> bool:
     """Return whether this system tells a server which user's program is at the other end of a loopback connection."""
     return sys.platform == "linux"
+
+
+def claim_port(listener: socket.socket) -> None:
+    """Let a TCP socket bind a port that was closed just now, but never one on which another program listens.
+
+    Windows' SO_REUSEADDR would let both listen, and a stranger receive what is meant for the other:
+    learn.microsoft.com/windows/win32/winsock/using-so-reuseaddr-and-so-exclusiveaddruse
+    """
+    option = socket.SO_EXCLUSIVEADDRUSE if sys.platform == "win32" else socket.SO_REUSEADDR
+    listener.setsockopt(socket.SOL_SOCKET, option, 1)
 
 
 # Files ----------------------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from skyloop.network.keys import Lab, load
 from skyloop.network.keys.identity import make_identity
 from tests.support.commands import Run
-from tests.support.systems import only_on
+from tests.support.systems import has_modes
 
 DAY = timedelta(days=1)
 
@@ -115,7 +115,7 @@ def test_a_missing_lab_is_reported_with_the_command_that_makes_one(
         pytest.param(
             ["--network", "--keys", "KEYS/open"],
             "open to others",
-            marks=only_on("linux", "darwin", reason="modes of files say nothing there"),
+            marks=has_modes,
         ),
     ],
 )

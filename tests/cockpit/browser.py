@@ -16,6 +16,7 @@ import pytest
 from skyloop.cockpit.child import CockpitProcess
 from tests.cockpit import firefox
 from tests.support.processes import Process
+from tests.support.systems import PLATFORM
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright
@@ -227,6 +228,8 @@ def _chromium(playwright: Playwright) -> Iterator[Browser]:
 def browser_and_cockpit(name: Literal["chromium", "firefox"] = "chromium") -> Iterator[tuple[Browser, str]]:
     """A browser, and the address of a cockpit that shows every proxy as it appears. Skips without a browser."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+    if PLATFORM != "linux":
+        pytest.skip(f"not on {PLATFORM}: the cockpit pairs one browser there, and these tests open many")
     if {"chromium": CHROMIUM, "firefox": firefox.FIREFOX}[name] is None:
         pytest.skip(f"no {name} here (Debian: apt install chromium firefox-esr)")
     with (

@@ -31,6 +31,7 @@ from skyloop.cockpit.access import (
 )
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
+from tests.support.systems import has_modes, only_on
 
 ANN = Token(Person(Role.PILOT, "ann"), b"0123456789abcdef")
 BOB = Token(Person(Role.OBSERVER), b"fedcba9876543210")
@@ -85,6 +86,7 @@ def test_invalid_token_files_are_reported(tmp_path: Path, text: str, said: str) 
         read_tokens(written(tmp_path, text))
 
 
+@has_modes
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o606])
 def test_a_file_that_others_may_read_is_refused(tmp_path: Path, mode: int) -> None:
     with pytest.raises(UsageError, match="chmod 600"):
@@ -149,6 +151,7 @@ def test_a_session_can_be_ended_and_there_are_not_too_many() -> None:
     assert gate.person(scope(cookie=f"c={newest}")) == ANN.person
 
 
+@has_modes
 def test_sessions_survive_a_restart_while_their_token_is_valid(tmp_path: Path) -> None:
     def gate(*tokens: Token, boot: str = "one", pairing: Pairing | None = None) -> TokenGate:
         return TokenGate(tokens, "c", pairing=pairing, kept=SessionFile(tmp_path / "sessions", boot))
@@ -232,6 +235,7 @@ def test_addresses_of_the_other_family() -> None:
     assert uid_in(HEAD + entry(f"{loopback}:0001", f"{loopback}:0002", 8), ("::1", 1), ("::1", 2)) == 8
 
 
+@only_on("linux", reason="reads the tables in /proc/net")
 @pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
 def test_the_kernel_identifies_the_caller(family: socket.AddressFamily) -> None:
     host = "127.0.0.1" if family == socket.AF_INET else "::1"
@@ -243,6 +247,7 @@ def test_the_kernel_identifies_the_caller(family: socket.AddressFamily) -> None:
         assert peer_uid(there, here) is None
 
 
+@only_on("linux", "darwin", reason="users have no numbers there")
 def test_only_this_user_and_the_superuser_are_admitted() -> None:
     asked: list[Any] = []
 

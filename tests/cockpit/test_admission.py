@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import os
 import resource
 import socket
 import ssl
@@ -17,7 +16,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import ManualClock, nanoseconds
 from skyloop.cockpit import listening
-from skyloop.cockpit.access import OpenGate, Person
+from skyloop.cockpit.access import Person
 from skyloop.cockpit.listening import (
     ANSWER_S,
     DESCRIPTORS_LEFT,
@@ -34,6 +33,7 @@ from skyloop.cockpit.listening import (
 )
 from skyloop.cockpit.security import ADMIT, Guard, own_names
 from skyloop.messages import Role
+from tests.support.cockpit import this_user
 
 PILOT, OBSERVER = Person(Role.PILOT, "ann"), Person(Role.OBSERVER, "bob")
 SMALL = Places(anonymous=6, anonymous_of_address=3, known=8, known_of_address=4)
@@ -317,7 +317,7 @@ def test_too_many_connections_are_refused_with_the_reason(kind: str, told: int) 
     state = {ADMIT: lambda person: f"too many of {person.role}s"}
     scope: dict[str, Any] = {"type": kind, "method": "GET", "path": "/ws/overview", "headers": headers, "state": state}
     scope |= {"client": ("127.0.0.1", 1), "server": ("127.0.0.1", 8123)}
-    guard = Guard(app, own_names("127.0.0.1", 8123), OpenGate(uid_of=lambda *_: os.geteuid()))
+    guard = Guard(app, own_names("127.0.0.1", 8123), this_user())
     asyncio.run(guard(scope, receive, send))
     last = sent[-1]
     assert (sent[0]["status"] if kind == "http" else last["code"]) == told

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import mimetypes
 import struct
 import threading
 import time
@@ -80,6 +81,17 @@ def test_the_page_and_its_files_are_served(drone: FakeDrone, tmp_path: Path) -> 
         for path in ("/static/../secret.txt", "/static/%2e%2e/secret.txt", "/static/nothing.js"):
             assert client.get(path).status_code == 404
         assert client.get("/nothing").status_code == 404
+
+
+def test_the_system_does_not_decide_what_a_script_is(
+    drone: FakeDrone, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A browser runs no module that is served as text, which is what the registry of many Windows computers says."""
+    mimetypes.init()
+    monkeypatch.setitem(mimetypes.types_map, ".js", "text/plain")
+    (tmp_path / "page.js").write_text("export {}")
+    with cockpit(fake_fleet({"alpha": drone}), static=tmp_path) as client:
+        assert "javascript" in client.get("/static/page.js").headers["content-type"]
 
 
 def test_drones_are_listed(client: TestClient) -> None:

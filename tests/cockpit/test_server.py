@@ -33,7 +33,8 @@ from skyloop.cockpit.encoded_feed import _ENCODER, NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState
-from tests.support.cockpit_page import PILOT, ask, served
+from tests.support.cockpit_page import PILOT, ask, log_in, served
+from tests.support.systems import only_on
 
 OBSERVER = "observer-token-0123456789"
 
@@ -168,6 +169,7 @@ def test_tokens_on_the_network(tokens: Path) -> None:
             pass
 
 
+@only_on("linux", reason="sessions end with the cockpit there")
 def test_a_session_is_valid_after_a_restart(tokens: Path) -> None:
     with bind("127.0.0.1", 0) as free:
         port = free.getsockname()[1]
@@ -183,6 +185,7 @@ def test_a_session_is_valid_after_a_restart(tokens: Path) -> None:
             assert json.load(answer)["name"] == "ann"
 
 
+@only_on("linux", reason="no one tells there whose program connects")
 def test_programs_of_this_user_are_admitted_without_a_token() -> None:
     with served() as address:
         assert ask(address, "/api/session") == {"role": "pilot", "name": "", "login": False, "hint": ""}
@@ -325,15 +328,15 @@ def test_where_no_one_tells_whose_program_connects_the_browser_is_paired(
 @pytest.mark.process
 def test_page_of_a_real_drone(tmp_path: Path) -> None:
     with connect("sim://?cameras=front&width=64&fps=10") as drone, CockpitProcess(drone.name) as page:
-        own = page.address().rstrip("/")
+        own, headers = log_in(page.address())
         streams = f"{own.replace('http', 'ws')}/ws/drones/{drone.name}"
-        with open_socket(f"{streams}/telemetry", origin=Origin(own)) as telemetry:
+        with open_socket(f"{streams}/telemetry", origin=Origin(own), additional_headers=headers) as telemetry:
             vehicle, state = (json.loads(telemetry.recv(5)) for _ in range(2))
             assert vehicle["cameras"] == [{"name": "front", "width": 64, "height": 48}]
             assert state["feedback"]["state"] == "landed"
             assert state["link"]["application"] == "up"
             assert state["truth"]["position"]
-        with open_socket(f"{streams}/video/front", origin=Origin(own)) as video:
+        with open_socket(f"{streams}/video/front", origin=Origin(own), additional_headers=headers) as video:
             frame = video.recv(5)
             assert isinstance(frame, bytes)
             assert frame[-2:] == b"\xff\xd9", "a whole JPEG file"
@@ -344,18 +347,18 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
         for foreign in (Origin("http://evil.example"), None):
             for path in ("telemetry", "control"):
                 with pytest.raises(InvalidStatus) as refused:
-                    open_socket(f"{streams}/{path}", origin=foreign)
+                    open_socket(f"{streams}/{path}", origin=foreign, additional_headers=headers)
                 assert refused.value.response.status_code == 403
         assert page.statistics()["frames_sent"] == 2
         assert drone.authority.state == "held", "who watches takes nothing away"
-        with Pages(own, drone.name, count=3) as pages:
+        with Pages(own, drone.name, count=3, token=page._token if headers else None) as pages:
             for client in pages.clients:
                 while client.frames < 3:
                     drone.next_frame()
             assert pages.problem is None
             assert pages.newest_age_s is not None
         assert page.statistics()["frames_encoded"] <= drone.stats["video/front"].count + 5
-        with open_socket(f"{streams}/control", origin=Origin(own)) as control:
+        with open_socket(f"{streams}/control", origin=Origin(own), additional_headers=headers) as control:
             control.send(f'{{"do":"take","priority":2,"at_s":{time.monotonic()}}}')
             told: dict[str, Any] = {}
             while told != {"type": "done", "do": "take"}:
@@ -378,6 +381,7 @@ def test_the_process_keeps_its_priority(tmp_path: Path) -> None:
     assert not Path(f"/proc/{pid}").exists()
 
 
+@only_on("linux", reason="threads have no niceness of their own there")
 def test_encoding_threads_have_a_lower_priority() -> None:
     usual = os.getpriority(os.PRIO_PROCESS, 0)
     assert _ENCODER.submit(os.getpriority, os.PRIO_PROCESS, 0).result(5) == usual + NICENESS

@@ -136,6 +136,22 @@ def test_a_command_that_ended_the_flight_during_a_silence_is_repeated_afterwards
     assert {(command.action, command.automatic) for command in flown.goes_on(0.5)} == {(action, False)}
 
 
+def test_pings_without_hearing_keep_nothing_within_a_step_of_the_clock() -> None:
+    """On Windows, where a step takes 15.6 ms, such a page kept control, and its vehicle hovered instead of landing."""
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.pilot.command(Velocity(forward=0.5))
+    flown.goes_on(2.1)
+    before = len(flown.sent)
+    for _ in range(50):
+        flown.now_ns += S // 64
+        flown.pilot.present_until(flown.now_ns)
+        assert not flown.pilot.is_present(flown.now_ns)
+        flown.pilot.tick(flown.now_ns)
+    assert len(flown.sent) == before
+
+
 def test_older_reports_never_override_newer_ones() -> None:
     flown = Flown()
     flown.hold(5)

@@ -14,6 +14,8 @@ from skyloop.transport.testing import wait_until
 from tests.host.fleet import Hosting, Vehicle, closing_reason
 from tests.support.systems import only_on
 
+pytestmark = only_on("linux", "darwin", reason="each link has a thread of its own")
+
 FAR_NS = 3600 * 10**9
 
 
@@ -139,7 +141,6 @@ class Linked(Vehicle):
         self.serve_link(self.own_link)
 
 
-@only_on("linux", "darwin", reason="each link has a thread of its own")
 def test_a_vehicle_whose_link_hangs_ends_alone(hosting: Hosting) -> None:
     stuck, good = Linked(), Linked()
     hosting.drivers.update(stuck=stuck, good=good)

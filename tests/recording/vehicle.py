@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import cv2
 import numpy as np
 
+from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
 from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, Intrinsics
 from tests.support.fake_vehicle import PERIOD_S, FakeVehicle
@@ -46,7 +45,7 @@ class Vehicle(FakeVehicle):
         number = 0
         while not self._ended.wait(PERIOD_S):
             number += 1
-            now_ns = time.monotonic_ns()
+            now_ns = monotonic_ns()
             place = (number * 0.01, 0.0, 1.0)
             sink.feedback(
                 Feedback(

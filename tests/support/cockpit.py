@@ -19,7 +19,8 @@ from skyloop.client import Authority, Drone
 from skyloop.client.drone import open_drone
 from skyloop.client.frame import FeedbackHistory, Frame, ReceivedFrame
 from skyloop.client.monitoring import ChannelStats, Distribution
-from skyloop.cockpit.access import Gate, OpenGate
+from skyloop.clock import monotonic_ns
+from skyloop.cockpit.access import Gate, OpenGate, Person, Scope
 from skyloop.cockpit.alarms import PARAMETERS, USUAL
 from skyloop.cockpit.app import create_app
 from skyloop.cockpit.discovery import FoundProxy
@@ -62,6 +63,7 @@ from skyloop.recording.options import RecorderState, Status
 from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.transport.memory import MemoryServer
 from tests.support.fake_vehicle import NEXT
+from tests.support.systems import PLATFORM
 from tests.support.testclient import TestClient, WebSocketTestSession
 
 OWN = "http://127.0.0.1:8123"
@@ -104,7 +106,7 @@ class FakeStream:
     def encode(self, *, key: bool = False, lost: int = 0, captured_ns: int | None = None) -> EncodedFrame:
         """Deliver the next picture, after losing some on the way."""
         self.seq += 1 + lost
-        now = time.monotonic_ns()
+        now = monotonic_ns()
         size = (round(64 * self.request.scale), round(48 * self.request.scale))
         data = b"\0\0\1key" if key else b"\0\0\1"
         picture = EncodedFrame(self.request.camera, self.seq, captured_ns or now, now, *size, "h264", key, data)
@@ -141,6 +143,7 @@ class FakeDrone:
         self.closed = False
         self._size = width, height
         self._seq = 0
+        self._shown_ns = 0
 
     def feedback(self, *, max_hz: float | None = None) -> Feedback:
         if self.newest is None:
@@ -193,7 +196,7 @@ class FakeDrone:
         width, height = self._size
         pixels = np.full((height, width, 3), shade, np.uint8) if image is None else image
         self._seq += 1
-        now = time.monotonic_ns()
+        now = self._shown_ns = max(monotonic_ns(), self._shown_ns + 1)  # no two within a step of a coarse clock
         header = FrameHeader(camera, self._seq, captured_ns or now, now, width, height, Encoding.BGR8, pixels.size)
         frame = ReceivedFrame(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
         for function in list(self.processors[camera]):
@@ -201,7 +204,7 @@ class FakeDrone:
         return frame
 
     def tell(self, text: str, kind: EventKind = EventKind.VEHICLE_MESSAGE, **values: Any) -> None:
-        event = Event(kind, text, time.monotonic_ns(), **values)
+        event = Event(kind, text, monotonic_ns(), **values)
         self.told.append(event)
         for function in list(self.event_listeners):
             function(event)
@@ -214,7 +217,7 @@ class FakeDrone:
 def flying(**values: Any) -> Feedback:
     """Return the feedback of a vehicle in the air."""
     known: dict[str, Any] = {
-        "captured_ns": time.monotonic_ns(),
+        "captured_ns": monotonic_ns(),
         "state": FlightState.FLYING,
         "battery": 0.8,
         "roll_rad": 0.1,
@@ -292,7 +295,7 @@ class Flyer(Driver):
             moved = (c * v.forward - s * v.left, s * v.forward + c * v.left, v.up)
             self.place = [at + step * self.PERIOD_S for at, step in zip(self.place, moved, strict=True)]
             self.yaw += v.yaw_rate * self.PERIOD_S
-            now_ns = time.monotonic_ns()
+            now_ns = monotonic_ns()
             sink.feedback(
                 Feedback(
                     captured_ns=now_ns,
@@ -381,9 +384,16 @@ class FakeRecorder:
         self.closed = True
 
 
+class EveryoneGate(OpenGate):
+    """Admits every caller, where :class:`OpenGate` admits none: Windows has no user ids."""
+
+    def person(self, scope: Scope) -> Person:
+        return self._person
+
+
 def this_user(role: Role = Role.PILOT) -> OpenGate:
     """Treat every caller as this user."""
-    return OpenGate(role, uid_of=lambda *_: os.geteuid())
+    return EveryoneGate(role) if PLATFORM == "win32" else OpenGate(role, uid_of=lambda *_: os.geteuid())
 
 
 def fake_fleet(drones: Mapping[str, FakeDrone]) -> CockpitFleet:

@@ -126,6 +126,17 @@ def served(**options: Any) -> Iterator[str]:
     assert not thread.is_alive()
 
 
+def log_in(address: str) -> tuple[str, dict[str, str]]:
+    """Open the address of a cockpit as a browser does; return its origin, and the headers of the browser's session."""
+    origin, _, code = address.partition("/#pair=")
+    if not code:
+        return origin.rstrip("/"), {}
+    headers = {"content-type": "application/json", "origin": origin}
+    request = urllib.request.Request(f"{origin}/api/login", json.dumps({"token": code}).encode(), headers)
+    with urllib.request.urlopen(request, timeout=5) as answer:
+        return origin, {"cookie": answer.headers["set-cookie"].partition(";")[0]}
+
+
 def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext | None = None) -> Any:
     request = urllib.request.Request(f"{address}{path}")
     if token is not None:

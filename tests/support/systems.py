@@ -17,6 +17,9 @@ def only_on(*systems: str, reason: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(PLATFORM not in systems, reason=f"not on {PLATFORM}: {reason}")
 
 
+has_modes = only_on("linux", "darwin", reason="modes and groups of files say nothing there")
+
+
 def served_files(folder: Path) -> list[str]:
     """Return what is in a directory of proxies, except for the lock of Windows, where no directory can be locked."""
     return sorted(path.name for path in folder.iterdir() if PLATFORM != "win32" or path.name != ".lock")

@@ -18,10 +18,9 @@ from skyloop.transport.local import LocalServer, dial, list_names, names_of_othe
 from skyloop.transport.local.directory import directory_owner, find_directory, of_others
 from skyloop.transport.local.system import FAST, PORTABLE, serving_side, systems, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
-from tests.support.systems import only_on, served_files
+from tests.support.systems import has_modes, served_files
 
 pytestmark = pytest.mark.usefixtures("side")
-has_modes = only_on("linux", "darwin", reason="modes and groups of files say nothing there")
 
 
 @pytest.fixture

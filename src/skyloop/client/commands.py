@@ -164,7 +164,7 @@ class CommandSender:
             known_ns = self._present_until_ns
             if known_ns is None or until_ns <= known_ns:
                 return
-            absent, schedule = known_ns < self._clock(), self.schedule
+            absent, schedule = known_ns <= self._clock(), self.schedule
             self._present_until_ns, kind = until_ns, type(schedule.action)
             ends = kind is Land or (kind is Hover and not schedule.automatic)  # a person may be waiting for this
             if absent and not ends:  # an old set-point must not take effect again when the person returns
@@ -176,7 +176,7 @@ class CommandSender:
 
     def is_present(self, now_ns: int) -> bool:
         """Return whether the person flying is known to be present; always True unless presence is required."""
-        return self._present_until_ns is None or now_ns <= self._present_until_ns
+        return self._present_until_ns is None or now_ns < self._present_until_ns
 
     # For the application ---------------------------------------------------------------------------------------
 
@@ -252,7 +252,7 @@ class CommandSender:
                 return schedule.intent, False
             intent = schedule.ask(action, now_ns, automatic=automatic)
             # From here on, the set-point is stored: if it can't be sent now, tick() can still send it within 0.5 s.
-            absent = self._present_until_ns is not None and now_ns > self._present_until_ns
+            absent = self._present_until_ns is not None and now_ns >= self._present_until_ns
             if not may_send or not connected or (absent and isinstance(action, _FLYING)):
                 if now:
                     if type(action) is not Land:  # after an error, the command must not be executed later

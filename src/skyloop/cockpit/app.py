@@ -57,6 +57,7 @@ from skyloop.messages import Role
 from skyloop.messages.parameter import WorldGeometry
 
 SMALLEST_PACKED: Final = 1000  #: minimum size of a response worth compressing [bytes]
+_KINDS: Final = mimetypes.MimeTypes()  # without what this computer says, which may be wrong on Windows
 _PACKED: Final = re.compile(r"text/.*|application/(javascript|json)|image/svg\+xml")  # media types to compress
 _NAMED_BY_HASH: Final = re.compile(r".+-[A-Z0-9]{8}\.\w+")  # esbuild's names of chunks (chunkNames in build.mjs)
 _REFERENCE: Final = re.compile(r'"/static/([\w.-]+)"')
@@ -98,7 +99,7 @@ class PageFiles(StaticFiles):
     async def page(self) -> Response:
         """Return the page, in which references to files carry a hash of their content."""
         try:
-            text = self._index.read_text()
+            text = self._index.read_text("utf-8")
         except OSError:
             return PlainTextResponse(f"The page is not built: there is no {self._index}. Run make in the sources.", 503)
         hashes: dict[str, str] = {}
@@ -134,7 +135,7 @@ class PageFiles(StaticFiles):
 
 def _read(full: str, stamp: tuple[int, int]) -> _File:
     plain = Path(full).read_bytes()
-    kind = mimetypes.guess_type(full)[0] or "application/octet-stream"
+    kind = _KINDS.guess_type(full)[0] or "application/octet-stream"
     packs = len(plain) >= SMALLEST_PACKED and _PACKED.fullmatch(kind) is not None
     packed = gzip.compress(plain, 9, mtime=0) if packs else None
     return _File(stamp, kind, hashlib.sha256(plain).hexdigest()[:16], plain, packed)

@@ -29,6 +29,7 @@ from skyloop.errors import LinkError, MissingExtraError, ParameterError, Skyloop
 from skyloop.extend import Known
 from skyloop.messages import CameraInfo, Capabilities, Event, Parameter, ParameterType, Value
 from skyloop.messages.frame import H264, Chain
+from skyloop.platform import claim_port
 from skyloop.recording import foxglove, layout
 from skyloop.recording.backlog import Item
 from skyloop.recording.foxglove import CompressedVideo
@@ -452,9 +453,12 @@ class OriginGuard:
 
         class Server(socketserver.ThreadingTCPServer):
             address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            allow_reuse_address = True
             daemon_threads = True
             block_on_close = False
+
+            def server_bind(self) -> None:
+                claim_port(self.socket)
+                super().server_bind()
 
             def handle_error(self, request: Any, client_address: Any) -> None: ...
 

@@ -18,6 +18,7 @@ from skyloop.network.keys import Lab, load
 from skyloop.network.keys.credentials import expiry_warning, make_directory, write
 from skyloop.network.keys.identity import make_identity
 from tests.network.keys.conftest import NOW
+from tests.support.systems import has_modes
 
 DAY = timedelta(days=1)
 
@@ -65,7 +66,12 @@ def _sign_away(folder: Path) -> None:
     [
         (lambda mine, _: shutil.rmtree(mine), UsageError, "there is no folder"),
         (lambda mine, _: (mine / "identity.key").unlink(), UsageError, "the private key .* can't be read"),
-        (lambda mine, _: (mine / "identity.key").chmod(0o644), UsageError, "open to others .mode 0644.*chmod 600"),
+        pytest.param(
+            lambda mine, _: (mine / "identity.key").chmod(0o644),
+            UsageError,
+            "open to others .mode 0644.*chmod 600",
+            marks=has_modes,
+        ),
         (lambda mine, _: (mine / "identity.key").write_bytes(b"x"), FileFormatError, "not an unencrypted private key"),
         (lambda mine, _: _other_kind_of_key(mine), FileFormatError, "not a key made by"),
         (
@@ -192,6 +198,7 @@ def test_a_directory_that_cannot_be_made(tmp_path: Path) -> None:
         make_directory(tmp_path / "file" / "keys")
 
 
+@has_modes
 def test_a_directory_that_is_open_to_others(tmp_path: Path) -> None:
     (tmp_path / "keys").mkdir(mode=0o755)
     with pytest.raises(UsageError, match="is open to others"):

@@ -13,6 +13,7 @@ from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.network.keys import KeyRole, Lab, Roster, load
 from skyloop.network.keys.identity import make_identity
 from tests.network.keys.conftest import NOW
+from tests.support.systems import has_modes
 
 DAY = timedelta(days=1)
 
@@ -115,6 +116,7 @@ def test_a_second_authority_in_one_folder_is_refused(lab: Lab) -> None:
         Lab.make(lab.directory, now=NOW)
 
 
+@has_modes
 def test_a_folder_open_to_others_is_refused(tmp_path: Path) -> None:
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o755)
@@ -144,6 +146,7 @@ def test_a_folder_without_an_authority_is_reported(tmp_path: Path) -> None:
         Lab.open(tmp_path)
 
 
+@has_modes
 def test_an_authority_readable_by_others_is_refused(lab: Lab) -> None:
     (lab.directory / "ca.key").chmod(0o640)
     with pytest.raises(UsageError, match=r"mode 0640.*chmod 600"):

@@ -30,6 +30,7 @@ from tests.recording.streams import film
 from tests.support.fake_vehicle import PERIOD_S, FakeVehicle
 from tests.support.nodes import Node, far
 from tests.support.recording_files import read_image
+from tests.support.systems import PLATFORM
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: skyloop install foxglove")
 
@@ -408,7 +409,7 @@ def test_the_guard_closes_connections_with_too_long_or_no_requests() -> None:
             assert page.recv(12) == b""
     finally:
         door.close()
-    assert hidden_host() != hidden_host() or sys.platform != "linux"
+    assert hidden_host() != hidden_host() or PLATFORM != "linux"
 
 
 def test_without_the_sdk_the_error_says_what_to_install(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.errors import LinkError, UsageError
 from skyloop.faults import FaultInjector, Faults
+from skyloop.platform import claim_port
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
@@ -190,7 +191,7 @@ def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
     made = socket.socket(socket.AF_INET, kind)
     made.setblocking(False)
     if kind is socket.SOCK_STREAM:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        claim_port(made)
     try:
         made.bind(bind)
     except OSError as error:
