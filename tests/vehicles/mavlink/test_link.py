@@ -7,7 +7,6 @@ import select
 import socket
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -192,6 +191,8 @@ def test_a_serial_port() -> None:
 def test_an_unread_serial_port_is_lost_and_blocks_nothing() -> None:
     """The vehicle sends but reads nothing: commands return, the link is lost, and closing is immediate."""
     pytest.importorskip("serial")
+    import tty
+
     far, near = os.openpty()
     tty.setraw(near)
     vehicle, ending = Vehicle(ARDUPILOT), threading.Event()
