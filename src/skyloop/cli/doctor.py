@@ -30,6 +30,7 @@ from skyloop.cli.text import print_json
 from skyloop.client.preflight import Level, PreflightFinding
 from skyloop.errors import NoAnswerError, install_command
 from skyloop.messages import EventKind, LinkState, Severity
+from skyloop.platform import allow_restart
 
 if TYPE_CHECKING:
     from skyloop.drivers.base import Driver
@@ -241,7 +242,7 @@ def _free(kind: str, port: int) -> bool:
     """Return whether a program could bind this port."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
         if kind == "TCP":  # as servers do, so that a recently closed port counts as free
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            allow_restart(probe)
         try:
             probe.bind(("", port))
         except OSError:

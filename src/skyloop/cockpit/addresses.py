@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 
 from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.errors import UsageError
+from skyloop.platform import allow_restart
 
 DEFAULT_PORT: Final = 8420  #: TCP port of the page
 NEXT_PORTS: Final = 9  #: number of further ports to try if the default port is in use
@@ -50,7 +51,7 @@ def bind(address: str, port: int | None) -> socket.socket:
 
 def _bind(address: str, port: int) -> socket.socket:
     listening = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    allow_restart(listening)
     try:
         listening.bind((address, port))
         listening.listen(0)  # listen immediately, because two programs may bind the same port until one of them listens

@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 
 from skyloop.address import is_loopback
 from skyloop.errors import MissingExtraError, UsageError
+from skyloop.platform import allow_restart
 
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry
@@ -256,7 +257,6 @@ def _registry(sources: Callable[[], Iterable[Source]]) -> CollectorRegistry:
 
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
-    allow_reuse_address = True
 
     def __init__(self, where: tuple[str, int], registry: CollectorRegistry, deadline_s: float) -> None:
         host, port = where
@@ -276,7 +276,7 @@ class _Server(ThreadingHTTPServer):
 
     def server_bind(self) -> None:
         # The method of HTTPServer would look up this machine's name on the network.
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        allow_restart(self.socket)
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])

@@ -452,7 +452,7 @@ class OriginGuard:
 
         class Server(socketserver.ThreadingTCPServer):
             address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            allow_reuse_address = True
+            allow_reuse_address = sys.platform != "win32"  # see allow_restart
             daemon_threads = True
             block_on_close = False
 

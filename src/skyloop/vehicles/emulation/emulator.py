@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.errors import LinkError, UsageError
 from skyloop.faults import FaultInjector, Faults
+from skyloop.platform import allow_restart, socket_pair
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
@@ -40,7 +41,7 @@ class Loop:
 
     def __init__(self, name: str) -> None:
         self._selector = selectors.DefaultSelector()
-        self._waker, self._wakened = socket.socketpair()
+        self._waker, self._wakened = socket_pair()
         self._waker.setblocking(False)
         self._wakened.setblocking(False)
         self._posted: deque[Callable[[], None]] = deque()
@@ -190,7 +191,7 @@ def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
     made = socket.socket(socket.AF_INET, kind)
     made.setblocking(False)
     if kind is socket.SOCK_STREAM:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        allow_restart(made)
     try:
         made.bind(bind)
     except OSError as error:
