@@ -294,7 +294,7 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
     except PermissionError:
         return LinkTrouble(f"{port} can't be accessed", f"let this user enter {path.parent}")
     except OSError:
-        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MAX_LISTED_PORTS]
+        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))
         return _no_port(port, there)
     if not stat.S_ISCHR(status.st_mode):
         return LinkTrouble(f"{port} is not a serial port", "correct the port in the address")
@@ -310,7 +310,7 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
 def _windows_trouble(error: OSError, port: str, advice: str) -> LinkTrouble:
     from serial.tools.list_ports import comports  # from pyserial, which raised the error
 
-    there = sorted(str(found.device) for found in comports())[:_MAX_LISTED_PORTS]
+    there = sorted(str(found.device) for found in comports())
     if port not in there:
         return _no_port(port, there)
     # There, ports are always opened for exclusive use. pyserial's error has no number, but quotes the system's error.
@@ -318,7 +318,7 @@ def _windows_trouble(error: OSError, port: str, advice: str) -> LinkTrouble:
 
 
 def _no_port(port: str, there: list[str]) -> LinkTrouble:
-    known = f"; available ports: {', '.join(there)}" if there else ""
+    known = f"; available ports: {', '.join(there[:_MAX_LISTED_PORTS])}" if there else ""
     return LinkTrouble(f"there is no {port}", f"plug the vehicle in, or correct the port in the address{known}")
 
 
