@@ -254,7 +254,7 @@ def test_a_closed_console_of_windows_leaves_time_to_land(
     called: list[str] = []
 
     def handle(handler: Callable[[int], int], on: int) -> int:
-        handlers.append(handler) if on else handlers.remove(handler)
+        (handlers.append if on else handlers.remove)(handler)
         return 1
 
     windows(SetConsoleCtrlHandler=handle)
