@@ -136,7 +136,10 @@ def test_terminating_on_windows_leaves_a_child_time_to_end(monkeypatch: pytest.M
     with monkeypatch.context() as windows:
         windows.setattr(sys, "platform", "win32")
         windows.setattr(child._process, "terminate", child._process.kill)
+        os.kill(child.pid, signal.SIGSTOP)  # so that it reads both requests at once
         child.terminate()
+        child.terminate()
+        os.kill(child.pid, signal.SIGCONT)
         assert child.stdout.readline() == b"lands first\n"
         assert child.wait(20.0) == 0
         child.terminate()

@@ -69,6 +69,20 @@ def test_only_the_client_uses_private_attributes() -> None:
     assert not found, "use skyloop.extend, or add to it"
 
 
+def test_windows_can_import_all_test_modules() -> None:
+    """Modules that it lacks are imported where they are used, by tests that are skipped there."""
+    lacks = {"curses", "fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
+    found = [
+        f"{path.relative_to(TESTS)}: {alias.name}"
+        for path in sorted(TESTS.rglob("*.py"))
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Import)
+        for alias in node.names
+        if alias.name in lacks
+    ]
+    assert not found
+
+
 def test_no_test_module_imports_another() -> None:
     """What several share lies in a conftest, in a helper beside them or, for several rooms, in ``tests/support``."""
     found = []

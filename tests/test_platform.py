@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import ctypes
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
+import time
 import types
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +20,7 @@ import pytest
 
 from skyloop import platform
 from skyloop.child_process import ChildProcess
+from skyloop.clock import slept_ns
 from tests.support.systems import only_on
 
 pytestmark = only_on("linux", reason="compares the sides of Linux and Windows, and pretends that itself")
@@ -30,7 +33,8 @@ def windows(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def become(msvcrt: dict[str, Any] | None = None, **kernel32: Callable[..., Any]) -> None:
         monkeypatch.setitem(sys.modules, "msvcrt", types.SimpleNamespace(**(msvcrt or {})))
         library = types.SimpleNamespace(**kernel32)
-        monkeypatch.setattr(ctypes, "WinDLL", lambda name: {"kernel32": library}[name], raising=False)
+        monkeypatch.setattr(ctypes, "WinDLL", lambda _: library, raising=False)
+        monkeypatch.setattr(ctypes, "WINFUNCTYPE", ctypes.CFUNCTYPE, raising=False)
         monkeypatch.setattr(sys, "platform", "win32")
 
     return become
@@ -62,7 +66,8 @@ def test_a_session_is_ended_with_its_children(windows: Callable[..., None], monk
     ran: list[list[str]] = []
     monkeypatch.setattr(subprocess, "run", lambda command, **_: ran.append(command))
     platform.end_session(child)
-    assert ran == [["taskkill", "/f", "/t", "/pid", str(child.pid)]]
+    assert ran[0][0].endswith("System32/taskkill.exe"), "none of the current directory"
+    assert ran[0][1:] == ["/f", "/t", "/pid", str(child.pid)]
 
 
 def test_a_listener_shares_its_port_with_no_program(
@@ -213,7 +218,12 @@ def test_keys_of_a_windows_console(windows: Callable[..., None]) -> None:
         waits.append(wait_ms)
         return 0 if typed else 0x102
 
-    windows(GetStdHandle=lambda number: 3 if number == -10 else None, WaitForSingleObject=wait, ReadConsoleInputW=read)
+    windows(
+        GetStdHandle=lambda number: 3 if number == -10 else None,
+        GetConsoleMode=lambda *_: 0,
+        WaitForSingleObject=wait,
+        ReadConsoleInputW=read,
+    )
     with platform.single_keys(0) as keys:
         assert keys(1.0) == b"w\x1b[A" + "à".encode() + b"\x1b?"
         assert keys(0.5) is None
@@ -225,3 +235,114 @@ def test_keys_of_a_windows_console(windows: Callable[..., None]) -> None:
 def test_an_input_record_has_the_layout_of_windows() -> None:
     assert ctypes.sizeof(platform._input_record()) == 20
     assert platform._input_record().character.offset == 14
+
+
+@pytest.mark.parametrize("is_console", [True, False])
+def test_a_click_into_a_windows_console_stops_no_flight(windows: Callable[..., None], is_console: bool) -> None:
+    """By default it selects text, and output then waits until the selection ends."""
+    modes = {3: 0x1F7, 4: 0x3}
+
+    def get(console: Any, mode: Any) -> int:
+        mode._obj.value = modes[console.value]
+        return is_console
+
+    windows(
+        GetStdHandle=lambda number: {-10: 3, -11: 4}[number],
+        GetConsoleMode=get,
+        SetConsoleMode=lambda console, mode: modes.update({console.value: mode}),
+    )
+    with platform.single_keys(0):
+        assert modes[3] == (0x1B7 if is_console else 0x1F7)
+    assert modes[3] == 0x1F7
+    platform.show_escapes()
+    assert modes[4] == (0x7 if is_console else 0x3)
+
+
+def test_a_closed_console_of_windows_leaves_time_to_land(
+    windows: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows ends the process when the handler returns."""
+    handlers: list[Callable[[int], int]] = []
+    called: list[str] = []
+
+    def handle(handler: Callable[[int], int], on: int) -> int:
+        (handlers.append if on else handlers.remove)(handler)
+        return 1
+
+    windows(SetConsoleCtrlHandler=handle)
+    monkeypatch.setattr(time, "sleep", lambda seconds: called.append(f"waits {seconds:g} s"))
+    with platform.on_console_close(lambda: called.append("lands")):
+        assert handlers[0](0) == handlers[0](1) == 0, "Ctrl-C and Ctrl-Break are Python's"
+        assert called == []
+        assert handlers[0](2) == 0
+        assert called == ["lands", "waits 60 s"]
+    assert handlers == []
+
+
+def test_waits_are_precise(windows: Callable[..., None]) -> None:
+    asked: list[int] = []
+    windows(timeBeginPeriod=asked.append)
+    platform.wait_precisely.cache_clear()
+    platform.wait_precisely()
+    platform.wait_precisely()
+    assert asked == [1]
+
+
+def test_a_file_that_is_read_can_be_changed_a_moment_later(windows: Callable[..., None]) -> None:
+    tries: list[int] = []
+
+    def change() -> None:
+        tries.append(1)
+        if len(tries) < 4:
+            raise PermissionError(13, "in use")
+
+    with pytest.raises(PermissionError):
+        platform.change_file(change)
+    assert len(tries) == 1, "elsewhere, this is no matter of time"
+    windows()
+    platform.change_file(change)
+    assert len(tries) == 4
+
+    def refuse() -> None:
+        raise PermissionError(13, "not yours")
+
+    with pytest.raises(PermissionError, match="not yours"):
+        platform.change_file(refuse)
+
+
+def test_a_terminal_of_macos_is_waited_for_with_select(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.setattr(select, "poll", None)
+    reader, writer = os.pipe()
+    try:
+        assert not platform.wait_readable(reader, 0.0)
+        os.write(writer, b"x")
+        assert platform.wait_readable(reader, 10.0)
+        monkeypatch.undo()
+        monkeypatch.setattr(sys, "platform", "darwin")
+        os.dup2(reader, 1500)
+        try:
+            assert platform.wait_readable(1500, 10.0), "select takes descriptors up to 1,023"
+        finally:
+            os.close(1500)
+    finally:
+        os.close(reader)
+        os.close(writer)
+
+
+def test_macos_says_how_long_it_has_slept(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = {"CLOCK_MONOTONIC_RAW": 4, "CLOCK_UPTIME_RAW": 8}
+    for name, number in clocks.items():
+        monkeypatch.setattr(time, name, number, raising=False)
+    monkeypatch.setattr(time, "clock_gettime_ns", lambda clock: {4: 500, 8: 200}[clock])
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert slept_ns() == 300
+
+
+def test_bytes_that_wake_a_thread_of_windows_are_not_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        pair = socket.create_connection(server.getsockname()), server.accept()[0]
+    monkeypatch.setattr(socket, "socketpair", lambda: pair)
+    for end in platform.socket_pair():
+        with end:
+            assert end.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

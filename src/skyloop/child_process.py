@@ -349,7 +349,7 @@ def on_parent_end(stop: Callable[[], object], descriptor: int = 0) -> None:
     def watch() -> None:
         with suppress(OSError):  # if the pipe can't be read, treat it as closed
             while data := os.read(descriptor, 64):
-                if sys.platform == "win32" and data == _TERMINATE:
+                if sys.platform == "win32" and _TERMINATE in data:  # perhaps several at once
                     signal.raise_signal(signal.SIGTERM)
         stop()
 

@@ -12,6 +12,7 @@ from typing import Final, TypeVar
 import msgspec
 
 from skyloop.errors import FileFormatError, UsageError
+from skyloop.platform import change_file
 
 T = TypeVar("T")
 
@@ -95,4 +96,4 @@ def _settle(part: Path, place: Path) -> None:
         os.fsync(file.fileno())
     if place.exists():
         shutil.copymode(place, part)
-    part.replace(place)
+    change_file(lambda: part.replace(place))

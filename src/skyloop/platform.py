@@ -8,6 +8,7 @@ Modules that another system lacks are imported where they are used.
 from __future__ import annotations
 
 import asyncio
+import functools
 import math
 import os
 import select
@@ -31,7 +32,15 @@ _BELOW_NORMAL_PRIORITY_CLASS: Final = 0x00004000
 _THREAD_PRIORITY_LOWEST: Final = -2
 _POLL_S: Final = 0.005  # how often to ask where the system can't wait
 _CHUNK: Final = 4096
+_IN_USE_S: Final = 0.5  # how long to wait for programs that read a file before it is replaced or removed
+_CTRL_CLOSE_EVENT: Final = 2  # this and greater ones: the console closes, the user logs off, the computer shuts down
+_CLOSING_S: Final = 60.0  # longer than Windows waits for a process whose console has been closed
 _STD_INPUT_HANDLE: Final = -10
+_STD_OUTPUT_HANDLE: Final = -11
+#: learn.microsoft.com/windows/console/setconsolemode
+_ENABLE_VIRTUAL_TERMINAL_PROCESSING: Final = 0x0004
+_ENABLE_QUICK_EDIT_MODE: Final = 0x0040
+_ENABLE_EXTENDED_FLAGS: Final = 0x0080
 _KEY_EVENT: Final = 1
 #: What POSIX terminals send for the arrows, by virtual-key code (learn.microsoft.com/windows/win32/inputdev).
 _ARROWS: Final = {0x26: b"\x1b[A", 0x28: b"\x1b[B", 0x27: b"\x1b[C", 0x25: b"\x1b[D"}
@@ -59,8 +68,10 @@ def end_session(process: subprocess.Popen[Any]) -> None:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGTERM)
         return
-    # Windows has no process groups to signal; taskkill ends the tree of children (/t), which outlives its root.
-    subprocess.run(["taskkill", "/f", "/t", "/pid", str(process.pid)], capture_output=True, check=False)
+    # Windows has no process groups to signal; taskkill ends the tree of children (/t), which outlives its root. Without
+    # a path, a program of that name in the current directory would be preferred (CreateProcess, lpApplicationName).
+    taskkill = os.path.join(os.environ.get("SYSTEMROOT", r"C:\Windows"), "System32", "taskkill.exe")  # noqa: PTH118
+    subprocess.run([taskkill, "/f", "/t", "/pid", str(process.pid)], capture_output=True, check=False)
 
 
 def read_tail(descriptor: int, most: int) -> bytes:
@@ -83,6 +94,9 @@ def wait_readable(source: FileDescriptorLike, within_s: float) -> bool:
     """
     if sys.platform == "win32":
         return bool(select.select([source], [], [], within_s)[0])
+    if sys.platform == "darwin":  # whose poll(2) does not support devices, such as terminals and serial ports
+        with suppress(ValueError):
+            return bool(select.select([source], [], [], within_s)[0])
     poll = select.poll()
     poll.register(source, select.POLLIN)
     return bool(poll.poll(math.ceil(within_s * 1000.0)))
@@ -154,6 +168,57 @@ def on_signals(numbers: Sequence[int], call: Callable[[], object]) -> None:
         signal.signal(number, handle)
 
 
+@contextmanager
+def on_console_close(call: Callable[[], object]) -> Iterator[None]:
+    """Call a function, on another thread, if the console is closed during the block. Only Windows needs this.
+
+    Windows ends a process as soon as its handler for the event has returned, or after 5 s or less. Python's own handler
+    would return at once. learn.microsoft.com/windows/console/ctrl-close-signal, …/setconsolectrlhandler
+    """
+    if sys.platform != "win32":
+        yield
+        return
+    import ctypes
+
+    def handle(kind: int) -> int:
+        if kind >= _CTRL_CLOSE_EVENT:
+            call()
+            time.sleep(_CLOSING_S)
+        return 0  # Ctrl-C and Ctrl-Break are for Python's handler
+
+    handler = ctypes.WINFUNCTYPE(ctypes.c_int, ctypes.c_ulong)(handle)
+    kernel32 = ctypes.WinDLL("kernel32")
+    kernel32.SetConsoleCtrlHandler(handler, 1)
+    try:
+        yield
+    finally:
+        kernel32.SetConsoleCtrlHandler(handler, 0)
+
+
+@functools.cache
+def wait_precisely() -> None:
+    """Let waits of this process end within 1 ms of their time, not in steps of 15.6 ms as on Windows by default.
+
+    learn.microsoft.com/windows/win32/api/timeapi/nf-timeapi-timebeginperiod; it ends with the process.
+    """
+    if sys.platform == "win32":
+        import ctypes
+
+        ctypes.WinDLL("winmm").timeBeginPeriod(1)
+
+
+# Sockets --------------------------------------------------------------------------------------------------------
+
+
+def socket_pair() -> tuple[socket.socket, socket.socket]:
+    """Return two connected sockets. Those of Windows are TCP's, which must not hold back a byte that wakes a thread."""
+    pair = socket.socketpair()
+    if pair[0].family == socket.AF_INET:
+        for end in pair:
+            end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return pair
+
+
 def sees_peers() -> bool:
     """Return whether this system tells a server which user's program is at the other end of a loopback connection."""
     return sys.platform == "linux"
@@ -205,6 +270,23 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
     return True
 
 
+def change_file(change: Callable[[], object]) -> None:
+    """Replace or remove a file. Windows refuses this while a program reads the file, so try again for a moment there.
+
+    Python opens files without FILE_SHARE_DELETE (learn.microsoft.com/windows/win32/fileio/creating-and-opening-files).
+    """
+    deadline_s = time.monotonic() + (_IN_USE_S if sys.platform == "win32" else 0.0)
+    while True:
+        try:
+            change()
+        except PermissionError:
+            if time.monotonic() >= deadline_s:
+                raise
+            time.sleep(_POLL_S)
+        else:
+            return
+
+
 def own_uid() -> int:
     """Return this process's effective user; 0 on Windows, which has no such numbers."""
     if sys.platform == "win32":
@@ -237,7 +319,8 @@ def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
     suspend a flight, and Ctrl-S has no effect.
     """
     if sys.platform == "win32":
-        yield _console_keys
+        with _without_quick_edit():
+            yield _console_keys
         return
     import termios
     import tty
@@ -265,6 +348,39 @@ def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
         termios.tcsetattr(terminal, termios.TCSANOW, before)
 
 
+def show_escapes() -> None:
+    """Let a console of Windows interpret escape sequences instead of showing them."""
+    if sys.platform == "win32":
+        kernel32, console, mode = _console(_STD_OUTPUT_HANDLE)
+        if mode is not None:
+            kernel32.SetConsoleMode(console, mode | _ENABLE_VIRTUAL_TERMINAL_PROCESSING)
+
+
+@contextmanager
+def _without_quick_edit() -> Iterator[None]:
+    """Keep a click into a console of Windows from selecting text, which would stop the program at its next output."""
+    kernel32, console, mode = _console(_STD_INPUT_HANDLE)
+    if mode is not None:
+        kernel32.SetConsoleMode(console, mode & ~_ENABLE_QUICK_EDIT_MODE | _ENABLE_EXTENDED_FLAGS)
+    try:
+        yield
+    finally:
+        if mode is not None:
+            kernel32.SetConsoleMode(console, mode)
+
+
+def _console(number: int) -> tuple[Any, Any, int | None]:
+    """Return the library, the console's handle and its mode; None if this handle is of no console."""
+    import ctypes
+
+    if sys.platform != "win32":
+        raise NotImplementedError
+    kernel32, mode = ctypes.WinDLL("kernel32"), ctypes.c_ulong()
+    kernel32.GetStdHandle.restype = ctypes.c_void_p
+    console = ctypes.c_void_p(kernel32.GetStdHandle(number))
+    return kernel32, console, mode.value if kernel32.GetConsoleMode(console, ctypes.byref(mode)) else None
+
+
 def _console_keys(within_s: float) -> bytes | None:
     """Wait for keys in a console of Windows, by its input records.
 
@@ -274,11 +390,8 @@ def _console_keys(within_s: float) -> bytes | None:
     """
     import ctypes
 
-    if sys.platform != "win32":
-        raise NotImplementedError
-    kernel32 = ctypes.WinDLL("kernel32")
-    kernel32.GetStdHandle.restype = ctypes.c_void_p
-    console, count = ctypes.c_void_p(kernel32.GetStdHandle(_STD_INPUT_HANDLE)), ctypes.c_ulong()
+    kernel32, console, _ = _console(_STD_INPUT_HANDLE)
+    count = ctypes.c_ulong()
     records = (_input_record() * 64)()
     deadline_s, keys = time.monotonic() + within_s, b""
     while not keys:  # records of other kinds wake this, too: of the mouse, of keys that are released

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import pty
 import select
 import signal
 import subprocess
 import sys
-import termios
 import threading
 import time
 from collections.abc import Iterator
@@ -344,7 +342,7 @@ def test_any_terminal_input_is_parsed_as_keys(parts: list[bytes]) -> None:
 @pytest.fixture
 def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     """A terminal: the person's end, and the end used as standard input."""
-    person, program = pty.openpty()
+    person, program = os.openpty()
     with os.fdopen(program, "rb", buffering=0) as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
         yield person, program
@@ -353,6 +351,8 @@ def line(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
 
 @only_on("linux", "darwin", reason="consoles have no terminal settings")
 def test_ctrl_z_and_ctrl_s_are_keys_and_the_shells_terminal_settings_are_undone(line: tuple[int, int]) -> None:
+    import termios
+
     person, program = line
     before = termios.tcgetattr(program)
     with Keyboard() as keyboard:
@@ -481,7 +481,7 @@ class Terminal:
     """``skyloop teleop`` in a separate terminal."""
 
     def __init__(self, *arguments: str) -> None:
-        self._master, slave = pty.openpty()
+        self._master, slave = os.openpty()
         self.process = subprocess.Popen(
             [sys.executable, "-m", "skyloop", "teleop", *arguments], stdin=slave, stdout=slave, stderr=slave
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import resource
 import socket
 import ssl
 from typing import Any
@@ -266,6 +265,7 @@ def test_a_closed_listening_socket_ends_the_listener(monkeypatch: pytest.MonkeyP
 
 def test_this_process_has_places(monkeypatch: pytest.MonkeyPatch) -> None:
     assert places_here().known > 0
+    resource = pytest.importorskip("resource")
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     assert places_here() == Places()
 

@@ -7,7 +7,6 @@ import select
 import socket
 import struct
 import time
-import tty
 from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
@@ -16,7 +15,17 @@ from unittest.mock import Mock
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.byte_stream import END_S, STUCK_NS, LinePace, Rank, SerialStream, TcpStream, line_speed
+from skyloop.drivers.byte_stream import (
+    END_S,
+    STUCK_NS,
+    LinePace,
+    Rank,
+    SerialStream,
+    TcpStream,
+    line_speed,
+    serial_port,
+)
+from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.wire.codec import MavlinkCodec, Message
 from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.support.systems import PLATFORM, only_on
@@ -26,7 +35,9 @@ from tests.support.systems import PLATFORM, only_on
 def line() -> Iterator[tuple[int, str]]:
     """Open a serial line: its far end, and the device at this end."""
     if PLATFORM == "win32":
-        pytest.skip("a serial port has no descriptor on win32, where no vehicle is reached by one")
+        pytest.skip("fills the port behind the threads that write to it on win32")
+    import tty
+
     far, near = os.openpty()
     tty.setraw(near)
     os.set_blocking(far, False)
@@ -325,6 +336,81 @@ def test_a_port_without_a_readable_backlog_is_still_written_to(
 
 
 @pytest.fixture
+def windows_port(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, SerialStream, ManualClock]]:
+    """A serial port that is served as on Windows, and its far end."""
+    pytest.importorskip("serial")
+    tty = pytest.importorskip("tty")
+    far, near = os.openpty()
+    tty.setraw(near)
+    os.set_blocking(far, False)
+    clock = ManualClock()
+    with monkeypatch.context() as windows:
+        windows.setattr("skyloop.drivers.byte_stream.sys.platform", "win32")
+        stream = SerialStream(os.ttyname(near), 10_000_000, "x", "mavlink", clock)
+    os.close(near)
+    yield far, stream, clock
+    stream.close()
+    with suppress(OSError):
+        os.close(far)
+
+
+def test_a_port_of_windows_carries_bytes_both_ways(windows_port: tuple[int, SerialStream, ManualClock]) -> None:
+    far, stream, _ = windows_port
+    assert stream.read() == b""
+    for data in (b"one", b"two"):
+        os.write(far, data)
+        came = b""
+        while came != data:
+            assert select.select([stream], [], [], 10.0)[0], "a link can wait for it"
+            came += stream.read()
+        stream.write(data)
+        came = b""
+        while came != data:
+            assert select.select([far], [], [], 10.0)[0]
+            came += os.read(far, 100)
+    wait_until(lambda: stream._waiting() == 0, "all is written")
+
+
+def test_an_unread_port_of_windows_blocks_nothing(windows_port: tuple[int, SerialStream, ManualClock]) -> None:
+    far, stream, clock = windows_port
+    for _ in range(200):
+        stream.write(bytes(250))
+        clock.advance(0.001)
+    assert stream.dropped > 10
+    assert stream._waiting() > 1000
+    stream.write(b"stop", Rank.STOP)
+    sent = bytearray()
+    while select.select([far], [], [], 0.3)[0]:
+        sent += os.read(far, 65_536)
+    assert sent.endswith(b"stop"), "it precedes what was waiting"
+    assert len(sent) < 10_000 + 4096
+
+
+def test_an_unplugged_port_of_windows_is_noticed(windows_port: tuple[int, SerialStream, ManualClock]) -> None:
+    far, stream, _ = windows_port
+    assert stream._threads is not None
+    os.close(far)
+    assert select.select([stream], [], [], 10.0)[0]
+    with pytest.raises(ConnectionError, match="unplugged"):
+        stream.read()
+    threads = stream._threads
+    wait_until(lambda: not threads._threads[0].is_alive(), "the reading thread has ended")
+    threads._port.write = Mock(side_effect=OSError("gone"))
+    stream.write(b"x", Rank.COMMAND)
+    wait_until(lambda: threads._ended, "so has the writing one")
+    with pytest.raises(ConnectionError, match="unplugged"):
+        stream.write(b"x", Rank.COMMAND)
+
+
+def test_ports_are_named_as_users_write_them() -> None:
+    for given in ("COM3", "com3", "/COM3", r"\\.\COM3", "//./com3"):
+        assert serial_port(given) == "COM3"
+    assert serial_port("/dev/cu.usbmodem1") == "/dev/cu.usbmodem1"
+    assert serial_port("ttyACM0") is None
+    assert serial_port("COM") is None
+
+
+@pytest.fixture
 def peer() -> Iterator[socket.socket]:
     """A server that accepts one connection, and has room for little."""
     with socket.socket() as server:
@@ -372,6 +458,16 @@ def test_closing_on_windows_waits_for_a_second_and_then_resets(
         asked = [call[0] for call in asking.method_calls]
         assert asked == ["setblocking", "setsockopt", "close"]
         asking.setsockopt.assert_called_with(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("HH", 1, 1))
+
+
+def test_what_waits_to_be_sent_is_counted_on_macos(peer: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skyloop.drivers.byte_stream.sys.platform", "darwin")
+    with closing(TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())) as stream, stream._socket:
+        monkeypatch.setattr(stream, "_socket", asking := Mock())
+        asking.getsockopt.return_value = 123
+        assert stream._waiting() == 123
+        asking.getsockopt.assert_called_with(socket.SOL_SOCKET, 0x1024)
+        asking.getsockopt.return_value = 0
 
 
 @pytest.mark.parametrize("system", [PLATFORM, "win32"])

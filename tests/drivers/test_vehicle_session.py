@@ -233,6 +233,21 @@ def test_a_missing_port_lists_the_available_ones(tmp_path: Path) -> None:
     assert "available ports" not in serial_trouble(OSError(), str(tmp_path / "none"), "", tmp_path / "no").remedy
 
 
+def test_troubles_with_a_port_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = pytest.importorskip("serial.tools.list_ports")
+    monkeypatch.setattr(
+        ports, "comports", lambda: [SimpleNamespace(device=name) for name in ("COM7", "COM4", "COM5", "COM6", "COM8")]
+    )
+    monkeypatch.setattr("skyloop.drivers.vehicle_session.sys.platform", "win32")
+    missing = serial_trouble(OSError("could not open port 'COM3': FileNotFoundError(2, …)"), "COM3", "look")
+    assert missing.reason == "there is no COM3"
+    assert missing.remedy.endswith("available ports: COM4, COM5, COM6, COM7")
+    denied = OSError("could not open port 'COM4': PermissionError(13, 'Access is denied.', None, 5)")
+    assert serial_trouble(denied, "COM4", "look").reason == "another program uses COM4"
+    other = serial_trouble(OSError("Cannot configure port"), "COM8", "look")
+    assert (other.reason, other.remedy) == ("Cannot configure port", "look")
+
+
 def test_a_file_is_not_a_port(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "is not a serial port" in serial_trouble(OSError(), str(tmp_path / "file"), "").reason

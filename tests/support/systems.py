@@ -20,6 +20,11 @@ def only_on(*systems: str, reason: str) -> pytest.MarkDecorator:
 has_modes = only_on("linux", "darwin", reason="modes and groups of files say nothing there")
 
 
+def only_root(does: str) -> pytest.MarkDecorator:
+    """Skip a test unless it runs as root. ``does``: what only root can do."""
+    return pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason=f"only root can {does}")
+
+
 def served_files(folder: Path) -> list[str]:
     """Return what is in a directory of proxies, except for the lock of Windows, where no directory can be locked."""
     return sorted(path.name for path in folder.iterdir() if PLATFORM != "win32" or path.name != ".lock")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import grp
 import os
 import socket
 import stat
@@ -18,7 +17,7 @@ from skyloop.transport.local import LocalServer, dial, list_names, names_of_othe
 from skyloop.transport.local.directory import directory_owner, find_directory, of_others
 from skyloop.transport.local.system import FAST, PORTABLE, serving_side, systems, user_name
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
-from tests.support.systems import has_modes, served_files
+from tests.support.systems import has_modes, only_root, served_files
 
 pytestmark = pytest.mark.usefixtures("side")
 
@@ -86,7 +85,7 @@ def test_a_directory_in_an_open_place_is_refused(runtime_dir: Path) -> None:
 
 
 @has_modes
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can create another user's directory")
+@only_root("create another user's directory")
 def test_another_users_directory_is_refused(runtime_dir: Path) -> None:
     runtime_dir.mkdir(mode=0o700)
     os.chown(runtime_dir, 65534, 65534)
@@ -106,6 +105,8 @@ def test_a_file_in_place_of_the_directory_is_refused(runtime_dir: Path) -> None:
 
 @pytest.mark.side(FAST)
 def test_a_group_may_share_the_directory(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import grp
+
     group = grp.getgrgid(os.getegid())
     server = LocalServer("alpha", group=group.gr_name)
     server.start(ServerLog())
@@ -122,6 +123,8 @@ def test_a_group_may_share_the_directory(runtime_dir: Path, monkeypatch: pytest.
 
 @has_modes
 def test_a_group_must_exist_and_have_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    import grp
+
     with pytest.raises(UsageError, match="no group named 'no-such-group'"):
         LocalServer("alpha", group="no-such-group")
     monkeypatch.delenv("SKYLOOP_RUNTIME_DIR")

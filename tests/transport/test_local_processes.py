@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import grp
-import os
 import random
 import signal
 import socket
@@ -24,7 +22,7 @@ from skyloop.transport.local import LocalServer, dial, list_names, packets
 from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.system import FAST
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
-from tests.support.systems import served_files
+from tests.support.systems import only_root, served_files
 
 pytestmark = [pytest.mark.process, pytest.mark.usefixtures("side")]
 
@@ -248,7 +246,7 @@ def call_as_nobody(path: Path, *groups: int) -> subprocess.CompletedProcess[str]
 
 
 @pytest.mark.side(FAST)
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@only_root("become another user")
 def test_another_user_is_rejected_even_with_access_to_the_directory(runtime_dir: Path) -> None:
     with serving() as (_, log):
         path = runtime_dir / "alpha.sock"
@@ -261,8 +259,10 @@ def test_another_user_is_rejected_even_with_access_to_the_directory(runtime_dir:
 
 
 @pytest.mark.side(FAST)
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@only_root("become another user")
 def test_a_member_of_the_group_is_accepted(runtime_dir: Path) -> None:
+    import grp
+
     group = next(group for group in grp.getgrall() if group.gr_gid not in (0, 65534))
     runtime_dir.parent.chmod(0o755)
     server, log = LocalServer("alpha", group=group.gr_name), ServerLog()

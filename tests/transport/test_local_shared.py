@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import signal
 import threading
 from collections.abc import Iterator
 from functools import partial
@@ -12,11 +14,12 @@ import pytest
 from skyloop.transport.base import FEEDBACK, Dialer, Peer, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.conformance import TransportSuite
-from skyloop.transport.local import dial, packets
+from skyloop.transport.local import LocalServer, dial, packets
 from skyloop.transport.local.client import LocalClient
 from skyloop.transport.local.reactor import Reactor, SharedLocalServer, Source
 from skyloop.transport.priority import Lane
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
+from tests.support.systems import only_on
 
 pytestmark = pytest.mark.usefixtures("side")
 _names = (f"shared-{number}" for number in itertools.count())
@@ -260,3 +263,26 @@ def test_a_server_stops_after_its_reactor_has_ended() -> None:
     assert served.log.left
     assert reactor.empty
     served.client.close()
+
+
+@only_on("linux", "darwin", reason="no process forks")
+@pytest.mark.parametrize("shared", [True, False])
+def test_a_fork_that_stops_its_copy_leaves_the_server_to_its_parent(reactor: Reactor, shared: bool) -> None:
+    import warnings
+
+    server = SharedLocalServer("alpha", reactor) if shared else LocalServer("alpha")
+    server.start(ServerLog())
+    before = dial("alpha")(ClientLog())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # about forks beside threads, from Python 3.12
+        child = os.fork()
+    if child == 0:
+        signal.alarm(20)  # ends it if it hangs
+        server.stop()
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    before.send(packets.hello())
+    client = dial("alpha")(ClientLog())
+    client.close()
+    before.close()
+    server.stop()

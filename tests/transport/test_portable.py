@@ -34,7 +34,7 @@ from skyloop.transport.local.reactor import Reactor, SharedLocalServer
 from skyloop.transport.local.server import ServerConnection
 from skyloop.transport.local.system import PORTABLE, SEND_FLAGS, Credentials, System, systems
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
-from tests.support.systems import PLATFORM, only_on
+from tests.support.systems import PLATFORM, only_on, only_root, served_files
 
 pytestmark = [pytest.mark.side(PORTABLE), pytest.mark.usefixtures("side")]
 SYSTEM: System = portable
@@ -266,7 +266,7 @@ except ConnectionResetError:
 
 @only_on("linux", "darwin", reason="accounts and memory are those of this system")
 @pytest.mark.process
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@only_root("become another user")
 def test_another_user_can_neither_connect_nor_read_frames(runtime_dir: Path) -> None:
     there = ClientLog()
     with serving() as (server, log):
@@ -510,13 +510,13 @@ def test_a_registration_that_can_not_be_made_leaves_nothing(runtime_dir: Path, m
         patch.setattr(Path, "replace", fail)
         with pytest.raises(OSError, match="No space"):
             LocalServer("alpha").start(ServerLog())
-    assert list(runtime_dir.iterdir()) == []
+    assert served_files(runtime_dir) == []
     with monkeypatch.context() as patch:
         patch.setattr("skyloop.platform.try_lock", lambda _: False)
         patch.setattr(portable, "_LOCKED_WITHIN_S", 0.01)
         with pytest.raises(LinkError, match="locked by another process"):
             LocalServer("alpha").start(ServerLog())
-    assert list(runtime_dir.iterdir()) == []
+    assert served_files(runtime_dir) == []
     with monkeypatch.context() as patch:
         patch.setattr(os, "open", fail)
         live = portable.is_live(runtime_dir / "alpha.port")
@@ -1102,6 +1102,38 @@ def test_slots_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     named_memory.NamedSlot(3, 0, 100)
 
 
+def test_a_name_that_a_client_still_uses_is_not_given_to_new_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Windows, the memory would be the old one, with its size and its picture."""
+    named_memory.prefix()
+    free = named_memory._process.free
+    monkeypatch.setattr(named_memory._process, "free", type(free)([5, 6]))
+    first = named_memory.NamedSlot(1, 0, 100)
+    first.array[:] = 7
+    name = first._name
+    held: Any = named_memory.map_named(name, 1, 100)
+    del first
+    if PLATFORM != "win32":  # where only the name's owner keeps it
+        held = named_memory._create(name, 164)
+    again = [named_memory.NamedSlot(2, 0, 5000)]
+    assert again[0]._name.endswith("-6")
+    with pytest.raises(OSError, match="slots"):
+        named_memory.NamedSlot(3, 0, 50)
+    del held
+    named_memory._unlink(name)
+    again.append(named_memory.NamedSlot(3, 0, 50))
+    assert again[1]._name == name
+    assert not again[1].array.any(), "it has nothing of the old picture"
+
+
+def test_an_unknown_name_is_no_memory() -> None:
+    name = f"{named_memory.prefix()}-fff"
+    with pytest.raises(LinkError, match="can't be mapped"):
+        named_memory.map_named(name, 1, 100)
+    slot = named_memory._create(name, 164)
+    assert slot[:] == bytes(164), "no client has made it"
+    named_memory._unlink(name)
+
+
 @only_on("linux", "darwin", reason="no process forks")
 def test_a_forks_copy_of_a_slot_removes_nothing() -> None:
     import warnings
@@ -1118,6 +1150,7 @@ def test_a_forks_copy_of_a_slot_removes_nothing() -> None:
     assert named(slot._name) == [slot._name]
 
 
+@only_on("linux", reason="there is one side only")
 def test_a_process_out_of_descriptors_does_not_settle_on_the_portable_side(monkeypatch: pytest.MonkeyPatch) -> None:
     """For its whole life, it would have seen no proxy of the fast side, and served under a name that one has."""
     sides = systems()

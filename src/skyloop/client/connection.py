@@ -18,6 +18,7 @@ from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
 from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import AnyReply, AnyRequest, Hello, LinkState, Refused, Welcome
+from skyloop.platform import wait_precisely
 from skyloop.transport.base import Dialer
 
 _CHECK_NS: Final = nanoseconds(0.05)  #: how often the link's state is evaluated
@@ -306,6 +307,7 @@ class ConnectionSupervisor:
     # On its thread ---------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        wait_precisely()
         while not self.connection.closing:
             pause_s = self.attend()
             self.connection.woken.wait_for(lambda: self.connection.poked, pause_s)

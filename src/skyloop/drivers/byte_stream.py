@@ -7,16 +7,17 @@ import re
 import socket
 import struct
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
 from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.errors import MissingExtraError
-from skyloop.platform import wait_readable
+from skyloop.platform import socket_pair, wait_readable
 
 CONNECT_S: Final = 1.0  #: time limit for establishing a TCP connection
 STUCK_NS: Final = nanoseconds(0.5)  #: time after which a connection with a full buffer is considered dead
@@ -25,7 +26,10 @@ _BITS_PER_BYTE: Final = 10  # bits sent per byte on a serial line, including sta
 _DRAIN_S: Final = 0.1  # time limit for closing one connection before opening the next
 END_S: Final = 0.5  #: time limit for the last close; TCP resends a lost packet after 0.2 s
 _UNACKNOWLEDGED_MS: Final = 2500  # time without acknowledgement after which TCP drops the connection
-_WINDOWS_BUFFER: Final = 4096  # of a TCP connection there [bytes], because what waits in it can't be counted
+_WINDOWS_BUFFER: Final = 4096  # of a connection there [bytes]; what waits in that of a TCP connection can't be counted
+_SO_NWRITE: Final = 0x1024  # bytes in a socket's output buffer (macOS' sys/socket.h, where TIOCOUTQ is for terminals)
+_LOOK_S: Final = 0.1  # how often the threads of a port of Windows check whether it is to be closed
+_AT_ONCE: Final = 256  # maximum number of bytes that such a thread writes at once
 _OVERDUE_NS: Final = nanoseconds(0.1)  # a line counts as stalled if bytes are unsent this long after they were due
 _TCP_OVERDUE_NS: Final = nanoseconds(0.3)  # TCP may acknowledge 0.2 s late, and by then has resent lost packets
 #: Size of the longest frame in MAVLink and MSP [bytes]. The parser of a flight controller consumes as many bytes as a
@@ -255,6 +259,8 @@ class TcpStream(ByteStream):
 
         with suppress(Exception):  # the count is unavailable, or the connection has ended
             self._socket.getpeername()  # raises if the connection has ended: lost bytes would still be counted
+            if sys.platform == "darwin":
+                return self._socket.getsockopt(socket.SOL_SOCKET, _SO_NWRITE)
             count: int = struct.unpack("i", fcntl.ioctl(self._socket, termios.TIOCOUTQ, bytes(4)))[0]
             return count
         return 0
@@ -272,26 +278,38 @@ class SerialStream(ByteStream):
         except ImportError as error:
             raise MissingExtraError(what, extra, cause=str(error)) from error
         super().__init__(LinePace(line_speed(path, baud)), clock)
-        self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+        self._threads: _PortThreads | None = None
+        if sys.platform == "win32":
+            self._port = serial.Serial(path, baud, timeout=_LOOK_S, exclusive=True)
+            self._threads = _PortThreads(self._port)
+        else:
+            self._port = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
         self._discard()
         self._whole = 0  # the previous connection may have left an incomplete frame
 
     def fileno(self) -> int:
-        number: int = self._port.fileno()
+        number: int = self._port.fileno() if self._threads is None else self._threads.near.fileno()
         return number
 
     def read(self) -> bytes:
         if not wait_readable(self, 0.0):
             return b""
-        data = os.read(self.fileno(), _READ_BYTES)  # pyserial's read() uses select.select: only descriptors below 1024
+        if self._threads is not None:
+            data = self._threads.near.recv(_READ_BYTES)
+        else:
+            data = os.read(self.fileno(), _READ_BYTES)  # pyserial's uses select.select: only descriptors below 1024
         if not data:
             raise ConnectionError("the port was unplugged, or another program reads it")
         return data
 
     def _write(self, data: bytes) -> int:
+        if self._threads is not None:
+            return self._threads.write(data)
         return os.write(self.fileno(), data)  # pyserial's write() retries while there is no room
 
     def _waiting(self) -> int:
+        if self._threads is not None:
+            return self._threads.waiting
         with suppress(Exception):  # unavailable, or the port has disappeared, which write() reports
             waiting: int = self._port.out_waiting
             return waiting
@@ -300,6 +318,8 @@ class SerialStream(ByteStream):
     def _discard(self) -> bool:
         before = self._waiting()
         with suppress(Exception):  # termios.error is not an OSError
+            if self._threads is not None:
+                self._threads.clear()
             self._port.reset_output_buffer()
             if not before or self._waiting() < before:  # some port drivers can't empty the buffer
                 self._whole, self._rest = 0, b""
@@ -310,7 +330,87 @@ class SerialStream(ByteStream):
         """Close the port and discard unsent data, which the system would otherwise wait to send, sometimes for 30 s."""
         if not self._drain():
             self._discard()
+        if self._threads is not None:
+            self._threads.close()
         self._port.close()
+
+
+class _PortThreads:
+    """Reads and writes a serial port on two threads, where a link can't wait for the port itself, as on Windows.
+
+    The port's timeout for reading is :data:`_LOOK_S`. Its calls for writing wait, but emptying its output buffer ends
+    them (learn.microsoft.com/windows/win32/api/winbase/nf-winbase-purgecomm).
+    """
+
+    def __init__(self, port: Any) -> None:
+        self._port = port
+        self.near, self._far = socket_pair()  #: receives what the port does
+        self.near.setblocking(False)
+        self._unsent = bytearray()
+        self._writing = 0  # number of bytes that are being written
+        self._closing = False
+        self._ended = False  # whether nothing more can be written
+        self._changed = threading.Condition()
+        self._threads = [
+            threading.Thread(target=work, name="skyloop-serial", daemon=True) for work in (self._read, self._send)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def waiting(self) -> int:
+        with self._changed:
+            return len(self._unsent) + self._writing
+
+    def write(self, data: bytes) -> int:
+        with self._changed:
+            if self._ended:
+                raise ConnectionError("the port was unplugged")
+            room = max(0, _WINDOWS_BUFFER - len(self._unsent) - self._writing)
+            self._unsent += data[:room]
+            self._changed.notify_all()
+            return min(room, len(data))
+
+    def clear(self) -> None:
+        with self._changed:
+            self._unsent.clear()
+
+    def close(self) -> None:
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self.near.close()
+        for thread in self._threads:
+            thread.join(END_S)
+
+    def _read(self) -> None:
+        with self._far, suppress(Exception):  # the port was unplugged or closed: the link reads the end
+            while not self._closing:
+                if data := self._port.read(max(1, self._port.in_waiting)):
+                    self._far.sendall(data)
+
+    def _send(self) -> None:
+        try:
+            while True:
+                with self._changed:
+                    self._writing = 0
+                    self._changed.wait_for(lambda: self._unsent or self._closing)
+                    if self._closing:
+                        return
+                    data = bytes(self._unsent[:_AT_ONCE])
+                    self._writing = len(data)
+                    del self._unsent[:_AT_ONCE]
+                self._port.write(data)
+        except Exception:  # noqa: BLE001  the port was unplugged
+            with self._changed:
+                self._ended = True
+
+
+def serial_port(place: str) -> str | None:
+    """Return the name of a serial port in an address, a path or Windows' ``COM3``; None if the text is neither."""
+    if found := re.fullmatch(r"(?:/|[/\\]{2}\.[/\\])?(com\d{1,3})", place, re.IGNORECASE):
+        return found[1].upper()
+    return place if place.startswith("/") else None
 
 
 def line_speed(path: str, baud: int) -> float | None:

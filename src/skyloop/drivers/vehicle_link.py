@@ -22,6 +22,7 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import ServedLink, Sink
 from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
+from skyloop.platform import socket_pair
 
 NAME_WAIT_S: Final = 0.2  #: time within which most name look-ups finish
 PAUSE_S: Final = 0.03  #: pause after an error
@@ -117,7 +118,7 @@ class VehicleLink(ABC, Generic[S]):
         self._clock = clock
         self._stopping = threading.Event()
         self._selector = selectors.DefaultSelector()
-        self._awake, self._waker = socket.socketpair()
+        self._awake, self._waker = socket_pair()
         self._lookup = NameLookup(family) if serve is None else NameLookup(family, wait_s=0.0)
         self._awake_ns = 0  # latest time at which the link's thread wakes
         self._opened_ns: int | None = None  # when sockets were last opened, or an attempt was made to open them

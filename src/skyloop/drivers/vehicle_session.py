@@ -25,7 +25,7 @@ from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severi
 
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
 _BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # error numbers if another program has locked the port
-_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*")  # patterns of port names below /dev
+_PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*", "cu.usb*")  # patterns of port names below /dev
 _MAX_LISTED_PORTS: Final = 4  # maximum number of ports that a message lists
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
@@ -286,15 +286,16 @@ def trouble_of(error: OSError, advice: str) -> LinkTrouble:
 
 def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path("/dev")) -> LinkTrouble:
     """Describe why a serial port can't be opened or has disappeared, and list the other ports in ``devices``."""
+    if sys.platform == "win32":
+        return _windows_trouble(error, port, advice)
     path = Path(port)
     try:
         status = path.stat()
     except PermissionError:
         return LinkTrouble(f"{port} can't be accessed", f"let this user enter {path.parent}")
     except OSError:
-        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MAX_LISTED_PORTS]
-        known = f"; available ports: {', '.join(there)}" if there else ""
-        return LinkTrouble(f"there is no {port}", f"plug the vehicle in, or correct the port in the address{known}")
+        there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))
+        return _no_port(port, there)
     if not stat.S_ISCHR(status.st_mode):
         return LinkTrouble(f"{port} is not a serial port", "correct the port in the address")
     if not os.access(path, os.R_OK | os.W_OK):
@@ -302,8 +303,27 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
             f"this user may not open {port} (mode {stat.S_IMODE(status.st_mode):04o})", _permission(port, status)
         )
     if error.errno in _BUSY:
-        return LinkTrouble(f"another program uses {port}", "end it (a ground station, ModemManager, another proxy)")
+        return _busy(port)
     return LinkTrouble(error.strerror or str(error) or type(error).__name__, advice)
+
+
+def _windows_trouble(error: OSError, port: str, advice: str) -> LinkTrouble:
+    from serial.tools.list_ports import comports  # from pyserial, which raised the error
+
+    there = sorted(str(found.device) for found in comports())
+    if port not in there:
+        return _no_port(port, there)
+    # There, ports are always opened for exclusive use. pyserial's error has no number, but quotes the system's error.
+    return _busy(port) if "PermissionError" in str(error) else LinkTrouble(str(error), advice)
+
+
+def _no_port(port: str, there: list[str]) -> LinkTrouble:
+    known = f"; available ports: {', '.join(there[:_MAX_LISTED_PORTS])}" if there else ""
+    return LinkTrouble(f"there is no {port}", f"plug the vehicle in, or correct the port in the address{known}")
+
+
+def _busy(port: str) -> LinkTrouble:
+    return LinkTrouble(f"another program uses {port}", "end it (a ground station, ModemManager, another proxy)")
 
 
 def _permission(port: str, status: os.stat_result) -> str:

@@ -34,6 +34,7 @@ from skyloop.host.host import Host, check_known
 from skyloop.host.vehicle import HostedVehicle, VehicleStatus, network_of, reason_of
 from skyloop.messages import LinkState
 from skyloop.metrics import serve_proxies
+from skyloop.platform import wait_precisely
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, announce, on_signals
 from skyloop.toml_file import Place
 from skyloop.transport.local.directory import find_directory
@@ -61,6 +62,7 @@ def serve(
     ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus. The address is printed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    wait_precisely()
     shutdown = Shutdown()
     with ExitStack() as stack:
         stack.enter_context(on_signals(shutdown, ignore_interrupt=False))

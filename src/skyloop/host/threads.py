@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import selectors
-import socket
 import threading
 import time
 from collections import deque
@@ -17,6 +16,7 @@ from typing import Any, Final, Protocol
 from skyloop.clock import beats, nanoseconds, seconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
+from skyloop.platform import socket_pair
 from skyloop.proxy import Proxy
 from skyloop.proxy.core.autopilot import PERIOD_S
 
@@ -302,7 +302,7 @@ class LinkThread:
         self.inside: Any = None  #: the vehicle whose link is currently being polled
         self.entries = 0  #: number of times :attr:`inside` was set
         self._selector = selectors.DefaultSelector()
-        self._waker, self._awake = socket.socketpair()
+        self._waker, self._awake = socket_pair()
         self._waker.setblocking(False)
         self._awake.setblocking(False)
         self._lock = threading.Lock()  # guards what is known about the links

@@ -20,6 +20,7 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind, LinkState, Severity
+from skyloop.platform import on_console_close, wait_precisely
 from skyloop.proxy.proxy import Proxy
 from skyloop.proxy.records import AuditTrail, FlightRecord, audit_path, record_path
 from skyloop.proxy.topics import OverviewRegistry
@@ -151,6 +152,7 @@ def run(
     that is entered while the proxies run.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
+    wait_precisely()
     shutdown = Shutdown()
     records = parent_fd is None if records is None else records
     if audit is not None or records:
@@ -266,7 +268,8 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
     before = {one: signal.signal(one, signal.SIG_IGN if ignore_interrupt else asked) for one in interrupts}
     before[signal.SIGTERM] = signal.signal(signal.SIGTERM, asked)
     try:
-        yield
+        with on_console_close(lambda: shutdown.request("its console was closed", hurry=False)):
+            yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

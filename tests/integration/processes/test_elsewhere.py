@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import select
 import signal
@@ -27,6 +26,7 @@ import skyloop
 from skyloop.messages import Failsafe, FlightState, LinkState
 from skyloop.transport.local import list_names
 from tests.support.processes import PILOTS, Process, eventually, skyloop_command, stopped
+from tests.support.systems import only_root
 from tests.support.tello_addresses import Addresses
 
 pytestmark = [
@@ -287,7 +287,7 @@ def test_an_emulated_tello(start: Callable[..., Process]) -> None:
 def test_keys_in_the_console(start: Callable[..., Process]) -> None:
     proxy_at(start)
     up = b"\x1b[A"
-    person, console = pty.openpty()
+    person, console = os.openpty()
     with (
         skyloop.connect("alpha", access="observe") as observer,
         subprocess.Popen(
@@ -432,7 +432,7 @@ def test_ctrl_c_lands(start: Callable[..., Process], sockets: Path, tmp_path: Pa
 # Others ------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+@only_root("become another user")
 def test_another_user_neither_connects_nor_sees_anything(
     start: Callable[..., Process], system: str, sockets: Path, tmp_path: Path
 ) -> None:

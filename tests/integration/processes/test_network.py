@@ -117,15 +117,15 @@ drone.wait(lambda feedback: False, 100)
 
 
 @pytest.mark.daily
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
 def test_a_dead_or_stopped_pilot_is_reported_and_the_vehicle_fails_safe(
-    far: Callable[..., Process], start: Callable[..., Process], place: str, how: signal.Signals
+    far: Callable[..., Process], start: Callable[..., Process], place: str, how: str
 ) -> None:
     far()
     pilot = start("-c", PILOT, place)
     pilot.until("flying")
     with skyloop.connect("alpha", network=place, access="observe") as drone:
-        pilot.signal(how)
+        pilot.signal(signal.Signals[how])
         lost = [EventKind.APPLICATION_LINK]
 
         def told() -> bool:

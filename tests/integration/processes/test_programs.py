@@ -36,9 +36,9 @@ LEAVES = BEGINS
 LANDS_AT_EXIT = BEGINS.replace("drone.takeoff()", "drone.takeoff()\natexit.register(drone.__exit__, None, None, None)")
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("number", ["SIGKILL", "SIGHUP"])
 def test_a_program_that_is_killed_over_its_own_proxy_leaves_a_drone_that_lands(
-    start: Callable[..., Process], number: signal.Signals
+    start: Callable[..., Process], number: str
 ) -> None:
     program = start("-c", STAYS, SIM)
     program.until("end")
@@ -46,7 +46,7 @@ def test_a_program_that_is_killed_over_its_own_proxy_leaves_a_drone_that_lands(
     with skyloop.connect(name, access="observe") as observer:
         states: list[str] = []
         observer.on_feedback(lambda feedback: states.append(feedback.state.value), inline=True)
-        program.signal(number)
+        program.signal(signal.Signals[number])
         eventually(lambda: "landed" in states, "it lands")
         assert "landing" in states
         eventually(lambda: observer.link.application.value == "lost", "its proxy ends")

@@ -8,7 +8,6 @@ import socket
 import struct
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -78,6 +77,8 @@ class Radio:
         if isinstance(proxy, int):
             self._far, self._proxy = _socket(0), ("127.0.0.1", proxy)
         else:
+            import tty
+
             self._serial, self._device = os.openpty()
             tty.setraw(self._device)
             for end in (self._serial, self._device):

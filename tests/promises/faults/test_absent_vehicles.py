@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pty
 import subprocess
 import sys
 import threading
@@ -93,7 +92,7 @@ def test_a_serial_port_that_is_missing_and_one_that_is_silent(start: Start, tmp_
     assert lost_s - serving_s < SAID_WITHIN_S
     assert f"there is no {port}" in line
     assert "→ plug the vehicle in" in line
-    ours, theirs = pty.openpty()
+    ours, theirs = os.openpty()
     try:
         port.symlink_to(os.ttyname(theirs))
         _, line = output.until("vehicle of absent: lost")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import grp
 import os
 import subprocess
 import sys
@@ -164,6 +162,9 @@ def test_an_observer_without_a_free_place_is_refused() -> None:
 
 def test_another_users_lock_delays_no_one(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     """A member of a group can open the directory for reading, and lock it for any time."""
+    import fcntl
+    import grp
+
     group = grp.getgrgid(os.getegid()).gr_name
     monkeypatch.setenv("SKYLOOP_GROUP", group)
     bravo = LocalServer("bravo", group=group)

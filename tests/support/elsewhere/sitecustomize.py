@@ -46,6 +46,7 @@ _POSIX_OS = (
 _LINUX_SOCKET = ("SO_PEERCRED", "MSG_CMSG_CLOEXEC", "SO_BINDTODEVICE", "SOCK_CLOEXEC")
 _POSIX_SOCKET = (
     "AF_UNIX", "SCM_RIGHTS", "CMSG_SPACE", "CMSG_LEN", "send_fds", "recv_fds", "MSG_DONTWAIT", "MSG_NOSIGNAL",
+    "SO_REUSEADDR",  # exists on Windows, where it lets any program take over a port
 )  # fmt: skip
 _MISSING: Mapping[str, Mapping[str, Sequence[str]]] = {
     "darwin": {
@@ -102,7 +103,7 @@ class TaggedMemory(mmap.mmap):
         if not tagname:
             return super().__new__(cls, number, length, *args, access=access, **more)  # type: ignore[misc]
         name = f"as-on-windows-{tagname}"
-        file = _in_use(f"/memfd:{name} (deleted)")
+        file = _in_use(_tagged(name))
         if file is None:
             file = os.memfd_create(name)
             os.ftruncate(file, length)
@@ -110,6 +111,42 @@ class TaggedMemory(mmap.mmap):
             return super().__new__(cls, file, length, access=access)  # keeps a duplicate of the descriptor
         finally:
             os.close(file)
+
+
+def _tagged(name: str) -> str:
+    return f"/memfd:{name} (deleted)"
+
+
+class _Winapi(types.ModuleType):
+    """What makes and opens memory with a name: handles are descriptors."""
+
+    INVALID_HANDLE_VALUE, NULL, PAGE_READWRITE, FILE_MAP_READ, ERROR_ALREADY_EXISTS = 2**64 - 1, 0, 4, 4, 183
+
+    def __init__(self) -> None:
+        super().__init__("_winapi")
+        self._newest = threading.local()
+
+    def CreateFileMapping(self, _file: int, _security: int, _protect: int, high: int, low: int, name: str) -> int:  # noqa: N802
+        name = f"as-on-windows-{name}"
+        found = _in_use(_tagged(name))
+        self._newest.error = 0 if found is None else self.ERROR_ALREADY_EXISTS
+        if found is None:
+            found = os.memfd_create(name)
+            os.ftruncate(found, (high << 32) + low)
+        return found
+
+    def OpenFileMapping(self, _access: int, _inherit: bool, name: str) -> int:  # noqa: N802
+        found = _in_use(_tagged(f"as-on-windows-{name}"))
+        if found is None:
+            raise FileNotFoundError(errno.ENOENT, "no memory of that name (WinError 2)")
+        return found
+
+    def GetLastError(self) -> int:  # noqa: N802
+        error: int = self._newest.error
+        return error
+
+    def CloseHandle(self, handle: int) -> None:  # noqa: N802
+        os.close(handle)
 
 
 def _in_use(link: str) -> int | None:
@@ -270,6 +307,12 @@ class _WindowsThread(threading.Thread):
             super().join(timeout)
 
 
+def _tcp_pair() -> tuple[socket.socket, socket.socket]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        far = socket.create_connection(server.getsockname())
+        return server.accept()[0], far
+
+
 def _wait_for_console(_: Any, wait_ms: int) -> int:
     """Wait for a key in the terminal, which sends each one at once from here on."""
     import termios
@@ -326,7 +369,10 @@ def _windows() -> dict[str, types.ModuleType]:
         GetCurrentProcess=lambda: 0,
         SetThreadPriority=lambda *_: 1,
         SetPriorityClass=lambda *_: 1,
+        SetConsoleCtrlHandler=lambda *_: 1,
+        timeBeginPeriod=lambda _: 0,
         GetStdHandle=lambda _: 1,
+        GetConsoleMode=lambda *_: 0,
         WaitForSingleObject=_wait_for_console,
         ReadConsoleInputW=_read_console,
     )
@@ -334,7 +380,8 @@ def _windows() -> dict[str, types.ModuleType]:
     console.__dict__.update(LK_NBLCK=2, locking=_locking, get_osfhandle=lambda descriptor: descriptor)
     return {
         "msvcrt": console,
-        "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32),
+        "_winapi": _Winapi(),
+        "ctypes": _StandIn(ctypes, (), WinDLL=lambda _: kernel32, WINFUNCTYPE=ctypes.CFUNCTYPE),
         "subprocess": _StandIn(subprocess, (), Popen=_WindowsPopen),
         "asyncio": _StandIn(asyncio, ()),
         "selectors": _StandIn(selectors, (), DefaultSelector=_WindowsSelector),
@@ -354,6 +401,7 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
         found["socket"].__dict__["SO_EXCLUSIVEADDRUSE"] = _EXCLUSIVE
         found["mmap"].__dict__["mmap"] = TaggedMemory
         found["select"].__dict__["select"] = _only_sockets
+        found["socket"].__dict__["socketpair"] = _tcp_pair
         found["time"].__dict__.update(_WINDOWS_CLOCKS)
         found["signal"].__dict__["SIGBREAK"] = signal.SIGUSR1
         found["os"].__dict__.update(fsync=_fsync, link=_link, kill=_kill)

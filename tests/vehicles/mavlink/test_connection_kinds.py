@@ -7,7 +7,6 @@ import select
 import socket
 import sys
 import time
-import tty
 from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -44,6 +43,8 @@ def by_tcp() -> Iterator[tuple[MavlinkConnection, socket.socket]]:
 @pytest.fixture
 def line() -> Iterator[tuple[int, str]]:
     """A serial line: its far end, and the local device."""
+    import tty
+
     far, near = os.openpty()
     tty.setraw(near)
     yield far, os.ttyname(near)

@@ -28,6 +28,8 @@ def understood(text: str) -> MavlinkOptions:
         ("mavlink://serial:/dev/ttyACM0:921600", ConnectionKind.SERIAL, "/dev/ttyACM0", 921600),
         ("mavlink://serial:/dev/serial/by-id/usb-x@1:9600", ConnectionKind.SERIAL, "/dev/serial/by-id/usb-x@1", 9600),
         ("mavlink://serial:/dev/ttyACM0", ConnectionKind.SERIAL, "/dev/ttyACM0", 57600),
+        ("mavlink://serial:COM3", ConnectionKind.SERIAL, "COM3", 57600),
+        (r"mavlink://serial:\\.\com12:115200", ConnectionKind.SERIAL, "COM12", 115200),
     ],
 )
 def test_connections(text: str, way: ConnectionKind, place: str, number: int) -> None:

@@ -32,6 +32,7 @@ def test_addresses() -> None:
     serial = options_of(parse_uri("msp:///dev/ttyACM0?baud=230400&override"))
     assert (serial.place, serial.baud, serial.serial, serial.override) == ("/dev/ttyACM0", 230400, True, True)
     assert "230400 baud" in str(serial)
+    assert options_of(parse_uri("msp:///COM3?baud=9600")).place == options_of(parse_uri("msp://com3")).place == "COM3"
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import select
 import socket
 import sys
 import threading
-import tty
 from collections.abc import Iterator
 from contextlib import suppress
 from unittest.mock import create_autospec
@@ -31,6 +30,8 @@ class Wire(threading.Thread):
     """Copies bytes between a pseudo-terminal and the emulated firmware."""
 
     def __init__(self, port: int) -> None:
+        import tty
+
         super().__init__(daemon=True)
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)

@@ -33,7 +33,7 @@ from skyloop.files import expand, read_bytes
 from skyloop.network.keys import certificates
 from skyloop.network.keys.certificates import Certificate, CertificateAuthority, PrivateKey
 from skyloop.network.keys.identity import Identity, KeyRole
-from skyloop.platform import is_open_to_others, lock_file
+from skyloop.platform import change_file, is_open_to_others, lock_file
 
 FORMAT: Final = 1  #: version of the roster's format
 _PURPOSE: Final = b"skyloop roster\n"  # prefix of all content that is signed here; no other signature uses it
@@ -272,7 +272,7 @@ def write(path: Path, content: bytes, *, private: bool = False) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+        change_file(lambda: temporary.replace(path))
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise UsageError(f"{path} can't be written: {error.strerror}") from None

@@ -96,12 +96,17 @@ class NamedSlot(SlotMemory):
         begin = prefix()
         self._owner = _process
         self._owner.keep()
-        try:
+        for _ in range(len(self._owner.free)):
             self._index = self._owner.free.popleft()
-        except IndexError:
-            raise OSError(errno.ENOSPC, f"this process has {MOST} slots") from None
-        self._name = f"{begin}-{self._index:x}"
-        view = _create(self._name, _OFFSET + self.capacity)
+            self._name = f"{begin}-{self._index:x}"
+            try:
+                view = _create(self._name, _OFFSET + self.capacity)
+                break
+            except FileExistsError:  # on Windows, a client still has the memory that had this name
+                self._owner.free.append(self._index)
+                self._index = -1
+        else:
+            raise OSError(errno.ENOSPC, f"this process has {MOST} slots")
         view[: _HEADER.size] = _HEADER.pack(_MAGIC, self.number, 0, self.capacity)
         return np.frombuffer(view, np.uint8, self.capacity, _OFFSET)
 
@@ -134,11 +139,28 @@ def map_named(name: str, number: int, capacity: int) -> Pixels:
 if sys.platform == "win32":
 
     def _create(name: str, size: int) -> mmap.mmap:
-        return mmap.mmap(-1, size, tagname=name)
+        import _winapi
+
+        # If somebody uses the name, CreateFileMapping and ``mmap`` return that memory, of its size and with its content
+        # (learn.microsoft.com/windows/win32/api/winbase/nf-winbase-createfilemappinga). The handle keeps it for ours.
+        none, most = (_winapi.INVALID_HANDLE_VALUE, _winapi.NULL), (size >> 32, size & 0xFFFFFFFF)
+        handle = _winapi.CreateFileMapping(*none, _winapi.PAGE_READWRITE, *most, name)
+        try:
+            if _winapi.GetLastError() == _winapi.ERROR_ALREADY_EXISTS:
+                raise FileExistsError(errno.EEXIST, "the name is in use", name)
+            return mmap.mmap(-1, size, tagname=name)
+        finally:
+            _winapi.CloseHandle(handle)
 
     def _open(name: str, size: int) -> mmap.mmap:
-        # A name that does not exist gives new memory, full of zeros; memory that is smaller is refused.
-        return mmap.mmap(-1, size, tagname=name, access=mmap.ACCESS_READ)
+        import _winapi
+
+        # Without this handle, an unknown name would give new memory, which the server could not use under that name.
+        handle = _winapi.OpenFileMapping(_winapi.FILE_MAP_READ, False, name)
+        try:
+            return mmap.mmap(-1, size, tagname=name, access=mmap.ACCESS_READ)
+        finally:
+            _winapi.CloseHandle(handle)
 
     def _unlink(name: str) -> None:
         """Do nothing: the last user's end frees the memory."""

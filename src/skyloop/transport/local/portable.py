@@ -35,7 +35,7 @@ from typing import Any, Final, NamedTuple
 
 from skyloop.child_process import leave_to_parent
 from skyloop.errors import LinkError, UsageError
-from skyloop.platform import lock_file, own_uid, try_lock
+from skyloop.platform import change_file, lock_file, own_uid, socket_pair, try_lock
 from skyloop.transport.base import Pixels
 from skyloop.transport.local.named_memory import NamedSlot, prefix, remove_names
 from skyloop.transport.local.system import (
@@ -363,7 +363,7 @@ class SelectorPoller:
 
     def __init__(self) -> None:
         self._selector = selectors.DefaultSelector()
-        self._woken, self._bell = socket.socketpair()
+        self._woken, self._bell = socket_pair()
         for end in (self._woken, self._bell):
             end.setblocking(False)
         self.waker = self._woken.fileno()
@@ -451,7 +451,7 @@ def _register(path: Path, registration: Registration) -> int:
             os.write(descriptor, _REGISTRATION.pack(_MAGIC, VERSION, port, pid, secret, memory.encode()))
         finally:
             os.close(descriptor)
-        Path(part).replace(path)
+        change_file(lambda: Path(part).replace(path))
     except BaseException:
         Path(part).unlink(missing_ok=True)
         raise
@@ -499,7 +499,7 @@ def remove(path: Path) -> None:
         registration = _read(path)
         if registration.memory != prefix():  # otherwise, other servers of this process have the same memory
             remove_names(registration.memory)
-    path.unlink(missing_ok=True)
+    change_file(lambda: path.unlink(missing_ok=True))
 
 
 def may_connect(sock: PacketSocket, gid: int | None) -> bool:  # noqa: ARG001
@@ -575,7 +575,7 @@ class Gate:
         self._strangers: dict[socket.socket, None] = {}  # oldest first
         self._meeting = threading.Lock()  # guards those
         self._waiting: deque[StreamSocket | str] = deque()  # admitted connections, or the reason why one was refused
-        self._ends = self._woken, self._bell = socket.socketpair()  # a byte for each of those
+        self._ends = self._woken, self._bell = socket_pair()  # a byte for each of those
         self._woken.setblocking(True)  # overrides socket.setdefaulttimeout()
         self._bell.setblocking(False)
         self._closing = False

@@ -13,6 +13,7 @@ import threading
 from functools import partial
 from typing import Final
 
+from skyloop.child_process import leave_to_parent
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.platform import own_uid
@@ -156,6 +157,7 @@ class LocalServer(TransportServer):
             listener, inode = self._directory.listen(self._name)
             self._started = True
             self._listener = listener
+            leave_to_parent(self)
             try:
                 self._begin(handler, listener, inode)
             except BaseException:
@@ -170,6 +172,11 @@ class LocalServer(TransportServer):
             target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
         )
         self._thread.start()
+
+    def forked(self) -> None:
+        """Leave the listener, its file and all connections to the parent process."""
+        self._state_lock, self._listener = threading.Lock(), None
+        self._connections, self._peers, self._topics = set(), {}, {}
 
     def stop(self) -> None:
         with self._state_lock:

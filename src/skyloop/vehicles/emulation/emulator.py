@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.errors import LinkError, UsageError
 from skyloop.faults import FaultInjector, Faults
-from skyloop.platform import claim_port
+from skyloop.platform import claim_port, socket_pair
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence, OccurrenceKind
@@ -41,7 +41,7 @@ class Loop:
 
     def __init__(self, name: str) -> None:
         self._selector = selectors.DefaultSelector()
-        self._waker, self._wakened = socket.socketpair()
+        self._waker, self._wakened = socket_pair()
         self._waker.setblocking(False)
         self._wakened.setblocking(False)
         self._posted: deque[Callable[[], None]] = deque()

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final
 
 from skyloop.drivers.base import Sink, reject_unknown_options
+from skyloop.drivers.byte_stream import serial_port
 from skyloop.drivers.live_camera import (
     INTRINSICS_OPTIONS,
     CameraSource,
@@ -62,7 +63,7 @@ FACINGS: Final = {
 }
 _EXAMPLES: Final = (
     "it should look like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, "
-    "mavlink://tcp:127.0.0.1:5760 or mavlink://serial:/dev/ttyACM0:921600"
+    "mavlink://tcp:127.0.0.1:5760, mavlink://serial:/dev/ttyACM0:921600 or mavlink://serial:COM3:921600"
 )
 KNOWN: Final = {
     *("sysid", "component", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "world_origin", "pose"),
@@ -180,7 +181,7 @@ def address_of(uri: VehicleUri) -> Address:
         place, number = rest, str(DEFAULT_BAUD)
     if not place or not 1 <= int(number) <= 10_000_000:
         raise UsageError(f"{uri} names no host or device: {_EXAMPLES}")
-    return Address(kind, place, int(number))
+    return Address(kind, serial_port(place) or place, int(number))
 
 
 def _peer(uri: VehicleUri) -> tuple[str, int] | None:

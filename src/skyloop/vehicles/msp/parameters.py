@@ -11,6 +11,7 @@ from functools import partial
 from typing import Final
 
 from skyloop.drivers.base import checked_value, reject_unknown_options
+from skyloop.drivers.byte_stream import serial_port
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Parameter, ParameterType, Value
@@ -20,7 +21,7 @@ from skyloop.vehicles.msp.setpoints import Gains, Limits, MspSetpoints
 DEFAULT_BAUD: Final = 115_200  #: the firmwares' own default for MSP
 DEFAULT_RATE_HZ: Final = 50.0  #: default rate of stick frames
 KNOWN: Final = {"baud", "rate", "override"}
-_EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200 or msp://tcp:127.0.0.1:5761"
+_EXAMPLES: Final = "it looks like msp:///dev/ttyACM0?baud=115200, msp://COM3 or msp://tcp:127.0.0.1:5761"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +46,9 @@ def options_of(uri: VehicleUri) -> MspOptions:
     reject_unknown_options(uri, KNOWN)
     rate = uri.number("rate", DEFAULT_RATE_HZ, minimum=20.0, maximum=250.0)
     override = uri.flag("override", default=False)
-    if uri.place.startswith("/"):
+    if (port := serial_port(uri.place)) is not None:
         baud = uri.whole("baud", DEFAULT_BAUD, minimum=9600, maximum=10_000_000)
-        return MspOptions(uri.place, None, baud, rate, override)
+        return MspOptions(port, None, baud, rate, override)
     if "baud" in uri.options:
         raise UsageError(f"{uri}: baud is for a serial port, such as msp:///dev/ttyACM0?baud=115200")
     word, _, rest = uri.place.partition(":")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -27,6 +26,8 @@ def real_betaflight() -> Iterator[None]:
         if os.environ.get("SKYLOOP_THIRD_PARTY") == "required":
             pytest.fail(str(error))
         pytest.skip(str(error))
+    import fcntl
+
     with (Path(tempfile.gettempdir()) / f"skyloop-betaflight-{os.getuid()}.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
