@@ -141,7 +141,7 @@ def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
     corners = project(rectangle(SIZE_M, SIZE_M) @ rotation.T + place, lens)
 
     image = np.full((_HEIGHT, _WIDTH), 0.5 * (case.white + case.black))
-    reach = _CELLS / (_CELLS - 2) / 2 * np.ptp(corners, axis=0).max() * 1.6 + 4 * case.blur_px + case.motion_px + 8
+    reach = 0.7 * np.ptp(corners, axis=0).max() + 4 * case.blur_px + case.motion_px / 2 + 4
     middle = corners.mean(axis=0)
     low = np.maximum(0, np.floor(middle - reach)).astype(int)
     high = np.minimum((_WIDTH, _HEIGHT), np.ceil(middle + reach)).astype(int)
@@ -255,7 +255,9 @@ def measure(shown: int, report: Callable[[str], None]) -> MarkerResults:
         numbers = [int(rng.integers(587)) for _ in range(shown)]
         images = [show(case, number, rng) for number in numbers]
         for name, detect in by_name.items():
-            seen = [(one, detect(one.image, one.intrinsics, number)) for one, number in zip(images, numbers, strict=True)]
+            seen = [
+                (one, detect(one.image, one.intrinsics, number)) for one, number in zip(images, numbers, strict=True)
+            ]
             scores.append(_score(case.name, name, seen))
     timings = []
     for what, image in empty_images():
