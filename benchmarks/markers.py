@@ -8,10 +8,7 @@ Each row has 30 markers in images of 640×480 with random ids, places, turns and
 otherwise, a marker's side is 48 px when seen from the front, tilted by 20°, on a white card, and noise has a standard
 deviation of 2 (of 255). The error of a marker is the mean distance of its four corners from the truth.
 
-Example:
-
-    python -m benchmarks.markers --output build/markers
-
+An example: ``python -m benchmarks.markers --output build/markers``. It takes a minute or two on one core.
 pupil-apriltags is a development tool only: ``pip install pupil-apriltags``.
 """
 
@@ -255,10 +252,8 @@ def measure(shown: int, report: Callable[[str], None]) -> MarkerResults:
         numbers = [int(rng.integers(587)) for _ in range(shown)]
         images = [show(case, number, rng) for number in numbers]
         for name, detect in by_name.items():
-            seen = [
-                (one, detect(one.image, one.intrinsics, number)) for one, number in zip(images, numbers, strict=True)
-            ]
-            scores.append(_score(case.name, name, seen))
+            found = [detect(one.image, one.intrinsics, number) for one, number in zip(images, numbers, strict=True)]
+            scores.append(_score(case.name, name, list(zip(images, found, strict=True))))
     timings = []
     for what, image in empty_images():
         report(f"time: {what}")

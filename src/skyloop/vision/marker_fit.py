@@ -20,19 +20,21 @@ from numpy.typing import NDArray
 from skyloop.vision.lens import Array
 
 Pixels = NDArray[np.float32]
-_ALONG: Final = np.linspace(0.08, 0.92, 20)  # where an edge is searched, as a fraction of its length
-_ACROSS: Final = np.linspace(-1.0, 1.0, 17)  # and how far from it, as a fraction of the reach
+_ALONG: Final = np.linspace(0.08, 0.92, 14)  # where an edge is searched, as a fraction of its length
+_ACROSS: Final = np.linspace(-1.0, 1.0, 13)  # and how far from it, as a fraction of the reach
 _REACH, _LEAST_REACH_PX = 0.8, 1.6  # reach across an edge: in cells, and the least in pixels
-_LEAST_PERIMETER_PX: Final = 28.0  # of a quadrilateral
-_NOISY: Final = 4.0  # grey levels: images with more noise are smoothed before the search
+_LEAST_CELL_PX: Final = 0.9  # smaller cells can't be read
+_NOISY: Final = 2.5  # grey levels: images with more noise are smoothed before the search
 _SHARPENING: Final = 0.25  # of cells against their neighbours, because blur mixes them
 _LEAST_CONTRAST: Final = 8.0  # grey levels between black and white
 _BORDER_ERRORS: Final = 0.25  # largest fraction of the border's cells that are not black
 _CORRECTED: Final = 0.6  # fraction of a dictionary's correctable bits that are corrected (OpenCV's default)
 _ITERATIONS: Final = 10
-_LEAST_LIKENESS: Final = 0.9  # fraction of the brightness's variance that the pattern must explain
-_LEAST_SIGMA_PX: Final = 0.015  # of a corner: lenses and prints are no better known
+_MOST_UNEXPLAINED: Final = 0.05  # fraction of the brightness's variance, besides noise
+_LEAST_SIGMA_PX: Final = 0.02  # of a corner: lenses and prints are no better known
 _SETTLED: Final = 0.01  # of a cell: smaller steps end the fit
+_MOST_ROWS: Final = 32_000  # of samples that OpenCV takes at once
+_ENDS: Final = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
 _MOST_SAMPLES: Final = 8  # per cell
 
 
@@ -68,12 +70,14 @@ class QuadFinder:
     Reading takes OpenCV a millisecond for each quadrilateral and a dictionary of 1000 markers, and fails on small ones.
     """
 
-    def __init__(self, cv: Any) -> None:
-        self._cv = cv
+    def __init__(self, cv: Any, cells: int) -> None:
+        """Prepare the search for squares of ``cells`` cells per side."""
+        self._cv, self._least_px = cv, 4 * _LEAST_CELL_PX * cells
+        self.noise = 0.0  #: standard deviation of the last image's noise, in grey levels
         self._parameters = parameters = cv.aruco.DetectorParameters()
         # One window suffices, because only the outer edge of the border counts.
         parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
-        parameters.polygonalApproxAccuracyRate = 0.05  # small and tilted markers have few pixels for each corner
+        parameters.polygonalApproxAccuracyRate = 0.04  # small and tilted markers have few pixels for each corner
         # The white card's edge is another square near the marker's, which must not hide it.
         parameters.minMarkerDistanceRate = parameters.minGroupDistance = 0.0
         # No image matches this code: all quadrilaterals are returned as rejected ones.
@@ -83,13 +87,13 @@ class QuadFinder:
 
     def find(self, grey: NDArray[np.uint8]) -> Array:
         """Return quadrilaterals (m, 4, 2), clockwise [px]."""
-        noise = _noise(grey)
+        self.noise = noise = _noise(grey)
         if noise > _NOISY:  # noise makes thousands of contours
             grey, noise = self._cv.GaussianBlur(grey, (3, 3), 0), 0.375 * noise
         wanted = (max(grey.shape), 7.0 if noise < _NOISY else max(7.0, round(1.3 * noise)))
         if wanted != self._set:
             self._set = wanted
-            self._parameters.minMarkerPerimeterRate = _LEAST_PERIMETER_PX / wanted[0]
+            self._parameters.minMarkerPerimeterRate = self._least_px / wanted[0]
             self._parameters.adaptiveThreshConstant = wanted[1]
             self._detector.setDetectorParameters(self._parameters)
         quads, _, others = self._detector.detectMarkers(grey)
@@ -98,7 +102,7 @@ class QuadFinder:
 
 def _noise(grey: NDArray[np.uint8]) -> float:
     """Return the standard deviation of the noise, from second differences along some rows."""
-    rows = grey[::8].astype(np.int16)
+    rows = grey[::16].astype(np.int16)
     if rows.shape[1] < 3:
         return 0.0
     return float(np.median(np.abs(rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]))) / (0.6745 * math.sqrt(6.0))
@@ -185,10 +189,45 @@ class PatternFit:
     covariance: Array  #: of the corners, (8, 8): x and y of the first, of the second … [px²]
 
 
+class _Template:
+    """A pattern drawn with some samples per cell, which are compared with the image."""
+
+    def __init__(self, pattern: NDArray[np.bool_], per_cell: int) -> None:
+        self._per_cell, self._half = per_cell, len(pattern) / 2
+        drawn = np.kron(np.pad(pattern, 2, constant_values=True), np.ones((per_cell, per_cell)))
+        self._drawn = drawn.astype(np.float32)
+        at = (np.arange(len(drawn)) + 0.5) / per_cell - 2.0  # in cells from the border's outer edge
+        margin = round(1.65 * per_cell)  # leaves 0.35 cells around the marker: white margins may be narrow
+        self._used = slice(margin, len(drawn) - margin)
+        # Coordinates of the samples: the marker reaches from -1 to 1.
+        self.u, self.v = (each[self._used, self._used].ravel() / self._half - 1.0 for each in np.meshgrid(at, at))
+
+    def blurred(self, cv: Any, blur: Array) -> tuple[Array, Array]:
+        """Return the samples' brightness (n,) after a blur, and its derivatives (n, 11).
+
+        Those are by the homography's eight parameters, and by the blur's covariance (2, 2) [cells²]: xx, yy, xy.
+        """
+        smooth = _blurred(cv, self._drawn, blur * self._per_cell**2)
+        du, dv = np.gradient(smooth, axis=1), np.gradient(smooth, axis=0)
+        seconds = (np.gradient(du, axis=1) / 2, np.gradient(dv, axis=0) / 2, np.gradient(du, axis=0))
+        value, du, dv, *seconds = (each[self._used, self._used].ravel() for each in (smooth, du, dv, *seconds))
+        scale = self._per_cell * self._half
+        du, dv, u, v = du * scale, dv * scale, self.u, self.v
+        along = du * u + dv * v
+        moving = [du * u, du * v, du, dv * u, dv * v, dv, -along * u, -along * v]
+        # A blur spreads brightness as heat does: its derivatives are second derivatives.
+        return value, np.stack([*moving, *(each * self._per_cell**2 for each in seconds)], axis=1)
+
+
 def fit_pattern(
-    cv: Any, image: NDArray[Any], corners: Array, pattern: NDArray[np.bool_], to_pixels: Callable[[Array], Array]
+    cv: Any,
+    image: NDArray[Any],
+    corners: Array,
+    pattern: NDArray[np.bool_],
+    to_pixels: Callable[[Array], Array],
+    noise: float,
 ) -> PatternFit | None:
-    """Align a marker's pattern with the image; None if it does not settle.
+    """Align a marker's pattern with the image; None if it does not explain the image, for example in a sharp shadow.
 
     Args:
         cv: OpenCV.
@@ -196,88 +235,67 @@ def fit_pattern(
         corners: First guess in the plane of an ideal camera, (4, 2) [px], from the pattern's top left.
         pattern: The cells with the black border, true where white.
         to_pixels: Turns points (n, 2) of that plane into pixels.
+        noise: Standard deviation of the image's noise, in grey levels.
     """
-    side = len(pattern)
-    cell_px = math.sqrt(max(1e-6, abs(cv.contourArea(corners.astype(np.float32))))) / side
+    cell_px = math.sqrt(max(1e-6, abs(cv.contourArea(corners.astype(np.float32))))) / len(pattern)
     per_cell = int(np.clip(math.ceil(cell_px), 4, _MOST_SAMPLES))
-    drawn = np.kron(np.pad(pattern, 2, constant_values=True), np.ones((per_cell, per_cell))).astype(np.float32)
-    at = (np.arange(len(drawn)) + 0.5) / per_cell - 2.0  # in cells from the border's outer edge
-    used = slice(round(1.65 * per_cell), len(drawn) - round(1.65 * per_cell))  # 0.35 cells around the marker
-    u, v = (each[used, used].ravel() * 2 / side - 1.0 for each in np.meshgrid(at, at))  # the marker is -1 … 1
-    ones = np.ones_like(u)
+    template = _Template(pattern, per_cell)
+    u, v, ones = template.u, template.v, np.ones_like(template.u)
     points = np.stack([u, v, ones], axis=1)
     shape = square_to(corners[None])[0] @ np.array([[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1.0]])
-    start, blur, likeness = corners, np.eye(2) * max(0.3, 0.7 / cell_px) ** 2, 0.0
-    weight = ones
-    spacing_px = cell_px / per_cell
+    blur = np.eye(2) * max(0.3, 0.7 / cell_px) ** 2
+    weight, part = ones, None
     for step in range(_ITERATIONS):
         flat = points @ shape.T
         where = to_pixels(flat[:, :2] / flat[:, 2:])
         if not np.isfinite(where).all():
             return None
-        if step == 0:
-            image, origin = _around(cv, image, where, spacing_px)
-            if image is None:
+        if part is None:
+            part, origin = _around(cv, image, where, cell_px / per_cell)
+            if part is None:
                 return None
-        seen = sample(cv, image, where - origin).astype(np.float64)
-        smooth = _blurred(cv, drawn, blur * per_cell**2)
-        du, dv = np.gradient(smooth, axis=1) * per_cell, np.gradient(smooth, axis=0) * per_cell
-        seconds = (np.gradient(du, axis=1), np.gradient(dv, axis=0), np.gradient(du, axis=0))
-        value, du, dv, duu, dvv, duv = (
-            each[used, used].ravel() for each in (smooth, du, dv, *(s * per_cell for s in seconds))
-        )
+        seen = sample(cv, part, where - origin).astype(np.float64)
+        value, slopes = template.blurred(cv, blur)
+        # Black and white may each change linearly across the marker.
         light = np.stack([value, value * u, value * v, ones, u, v], axis=1)
-        brightness = light * (weight**2)[:, None]
-        shade = np.linalg.solve(brightness.T @ light + 1e-9 * np.eye(6), brightness.T @ seen)
-        gain = (shade[0] + shade[1] * u + shade[2] * v)[:, None]
-        half = side / 2
-        along = (du * u + dv * v) * half
-        moving = [
-            *(du * half * c for c in (u, v, ones)),
-            *(dv * half * c for c in (u, v, ones)),
-            -along * u,
-            -along * v,
-        ]
-        blurring = [duu / 2, dvv / 2, duv]
-        rows = np.concatenate([gain * np.stack([*moving, *blurring], axis=1), light], axis=1)
-        weighted = rows * (weight**2)[:, None]
-        normal = weighted.T @ rows
-        normal[range(8, 11), range(8, 11)] *= 1.05  # blur is only a nuisance, and settles more slowly
+        trusted = light * (weight**2)[:, None]
+        shade = np.linalg.solve(trusted.T @ light + 1e-9 * np.eye(6), trusted.T @ seen)
+        gain = shade[0] + shade[1] * u + shade[2] * v
+        rows = np.concatenate([gain[:, None] * slopes, light], axis=1)
+        trusted = rows * (weight**2)[:, None]
+        normal = trusted.T @ rows
+        normal[range(8, 11), range(8, 11)] *= 1.05  # the blur settles more slowly, and matters less
         left = seen - light @ shade
         try:
-            found = np.linalg.solve(normal, weighted.T @ left)
+            found = np.linalg.solve(normal, trusted.T @ left)
         except np.linalg.LinAlgError:
             return None
         left -= rows @ found
         change = np.array([found[0:3], found[3:6], [found[6], found[7], 0.0]])
-        most = float(np.abs(change).max()) * half
+        most = float(np.abs(change).max()) * len(pattern) / 2
         shape = shape @ np.linalg.inv(np.eye(3) + change * min(1.0, 0.5 / max(most, 1e-9)))
         shape /= shape[2, 2]
         blur = _bounded(blur + np.array([[found[8], found[10]], [found[10], found[9]]]), 0.4 / per_cell)
-        deviation = 1.4826 * float(np.median(np.abs(left))) + 0.5
-        if step >= 1:
-            weight = 1.0 / (1.0 + (left / (4.0 * deviation)) ** 2)
-        likeness = 1.0 - float((left**2).mean()) / max(float(seen.var()), 1e-9)
         if step >= 2 and most < _SETTLED:
             break
-    ends = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-    flat = ends @ shape.T
+        if step >= 1:  # glare, dirt and shadows count less
+            deviation = 1.4826 * float(np.median(np.abs(left))) + 0.5
+            weight = 1.0 / (1.0 + (left / (4.0 * deviation)) ** 2)
+    flat = _ENDS @ shape.T
     fitted = flat[:, :2] / flat[:, 2:]
-    if likeness < _LEAST_LIKENESS or np.abs(fitted - start).max() > max(2.5, 1.2 * cell_px):
+    unexplained = (float((left**2).mean()) - noise**2) / max(float(seen.var()), 1e-9)
+    if unexplained > _MOST_UNEXPLAINED or np.abs(fitted - corners).max() > max(2.5, 1.2 * cell_px):
         return None
     # Neighbouring samples share pixels: only as many are independent as there are pixels.
-    shared = max(1.0, 1.0 / spacing_px**2)
-    noise = float((weight**2 * left**2).sum() / max(1.0, (weight**2).sum() - len(normal))) * shared
-    spread_of = np.linalg.inv(normal)[:8, :8] * noise
-    turned = np.zeros((8, 8))
-    for n, (x, y, _) in enumerate(ends):
-        moves = np.array([[x, y, 1, 0, 0, 0, -x * x, -x * y], [0, 0, 0, x, y, 1, -x * y, -y * y]])
-        slope = (shape[:2, :2] - np.outer(fitted[n], shape[2, :2])) / flat[n, 2]
-        turned[2 * n : 2 * n + 2] = slope @ moves
+    variance = float((weight * left) @ (weight * left) / ((weight**2).sum() - len(normal)))
+    covariance = np.linalg.inv(normal)[:8, :8] * variance * max(1.0, (per_cell / cell_px) ** 2)
+    moves = [([x, y, 1, 0, 0, 0, -x * x, -x * y], [0, 0, 0, x, y, 1, -x * y, -y * y]) for x, y, _ in _ENDS]
+    slope = (shape[:2, :2] - fitted[:, :, None] * shape[2, :2]) / flat[:, 2, None, None]
+    turned = (slope @ np.array(moves)).reshape(8, 8)
     # A Gaussian is not the true blur, which matters once it reaches the next cell (measured by benchmarks.markers).
-    blurred = float(np.linalg.eigvalsh(blur)[-1]) ** 1.5
-    least = _LEAST_SIGMA_PX**2 + (0.15 * cell_px * blurred) ** 2
-    return PatternFit(fitted, turned @ spread_of @ turned.T + least * np.eye(8))
+    spread = float(np.linalg.eigvalsh(blur)[-1]) ** 1.5
+    least = _LEAST_SIGMA_PX**2 + (0.15 * cell_px * spread) ** 2
+    return PatternFit(fitted, turned @ covariance @ turned.T + least * np.eye(8))
 
 
 def _around(cv: Any, image: NDArray[Any], where: Array, spacing_px: float) -> tuple[Any, Any]:
@@ -332,15 +350,11 @@ def mapped(shapes: Array, points: Array) -> Array:
 
 def sample(cv: Any, image: NDArray[Any], points: Array) -> Pixels:
     """Return the brightness at points (m, …, 2), interpolated between pixels."""
-    rows = np.ascontiguousarray(points.reshape(len(points), -1, 2), dtype=np.float32)
-    if points.ndim == 2:
-        rows = np.ascontiguousarray(points.reshape(-1, 1, 2), dtype=np.float32)
-    if len(rows) > 30000:
-        parts = [
-            cv.remap(image, each, None, cv.INTER_LINEAR, borderMode=cv.BORDER_REPLICATE)
-            for each in np.array_split(rows, len(rows) // 30000 + 1)
-        ]
-        found = np.concatenate(parts)
-    else:
-        found = cv.remap(image, rows, None, cv.INTER_LINEAR, borderMode=cv.BORDER_REPLICATE)
-    return np.asarray(found, dtype=np.float32).reshape(points.shape[:-1])
+    rows = np.ascontiguousarray(
+        points.reshape(-1 if points.ndim == 2 else len(points), points[0].size // 2, 2), np.float32
+    )
+    parts = [
+        cv.remap(image, rows[at : at + _MOST_ROWS], None, cv.INTER_LINEAR, borderMode=cv.BORDER_REPLICATE)
+        for at in range(0, len(rows), _MOST_ROWS)
+    ]
+    return np.asarray(np.concatenate(parts), dtype=np.float32).reshape(points.shape[:-1])

@@ -87,8 +87,8 @@ def _refined(cv: Any, outline_m: Array, rays: Array, inverse: Array, start: tupl
 class PoseChoice:
     """Chooses between the two poses of one marker: the right one is steady, the wrong one turns as the camera moves.
 
-    The costs of all chains of poses are accumulated (Viterbi), where a turn of the marker's normal from one frame to the
-    next costs the more, the larger it is.
+    The costs of all chains of poses are accumulated (Viterbi). A turn of the marker's normal from one frame to the next
+    costs the more, the larger it is.
     """
 
     _at_ns: int | None = None

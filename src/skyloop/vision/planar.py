@@ -132,8 +132,8 @@ class MarkerSighting(PlanarSighting):
 
     id: int
     error_px: float  #: root mean square distance between the corners and those of the pose
-    #: Covariance of the pose, (6, 6): of ``position_m`` [m], then of a small rotation vector [rad] that is applied after
-    #: ``rotation``; both along the camera's optical axes. It covers noise and blur, not a wrong lens or ``size_m``.
+    #: Covariance of the pose, (6, 6): of ``position_m`` [m], then of a small rotation vector [rad] that is applied
+    #: after ``rotation``; both along the camera's optical axes. Covers noise and blur, not a wrong lens or ``size_m``.
     covariance: Array
     #: The other pose that a square allows, and its ``error_px``; None if there is only one. Distinguishing them takes
     #: perspective, which small markers seen nearly from the front hardly show.
@@ -166,11 +166,12 @@ class MarkerDetector:
         self.size_m = float(size_m)
         self._cv = opencv("marker detection")
         self._codes = Codes(marker_dictionary(self._cv, dictionary))
-        self._finder = QuadFinder(self._cv)
+        self._finder = QuadFinder(self._cv, self._codes.size + 2)
         # The order and axes that SOLVEPNP_IPPE_SQUARE expects: x right, y up, z out of the face.
         self._square = rectangle(self.size_m, self.size_m)
         self._images = self._seen = 0
         self._others: Counter[tuple[str, int]] = Counter()  # count of tags from other dictionaries, by family and id
+        self._other_codes: dict[str, Codes] = {}
         self._choices: dict[int, PoseChoice] = {}
 
     def why_nothing(self) -> str:
@@ -238,8 +239,9 @@ class MarkerDetector:
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
         # Without correction, so that a square object in the room is not mistaken for a tag.
-        codes = Codes(marker_dictionary(self._cv, family), corrected=0.0)
-        self._others.update((family, number) for number, _ in self._read(grey, quads, codes))
+        if family not in self._other_codes:
+            self._other_codes[family] = Codes(marker_dictionary(self._cv, family), corrected=0.0)
+        self._others.update((family, number) for number, _ in self._read(grey, quads, self._other_codes[family]))
 
     def _sighting(
         self,
@@ -261,7 +263,7 @@ class MarkerDetector:
         ideal = normalised(corners, intrinsics) * focal + centre
         if not np.isfinite(ideal).all():
             return None
-        fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels)
+        fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels, self._finder.noise)
         covariance = np.eye(8) * _LINES_SIGMA_PX**2
         if fit is not None:
             ideal, covariance, corners = fit.corners, fit.covariance, to_pixels(fit.corners)
