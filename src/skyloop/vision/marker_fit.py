@@ -22,8 +22,9 @@ from skyloop.vision.lens import Array
 Pixels = NDArray[np.float32]
 _ALONG: Final = np.linspace(0.08, 0.92, 14)  # where an edge is searched, as a fraction of its length
 _ACROSS: Final = np.linspace(-1.0, 1.0, 13)  # and how far from it, as a fraction of the reach
-_REACH, _LEAST_REACH_PX = 0.8, 1.6  # reach across an edge: in cells, and the least in pixels
+_REACH, _CLOSE_REACH = (0.8, 1.6), (0.5, 1.2)  # across an edge, at first and then: in cells, and the least in pixels
 _LEAST_CELL_PX: Final = 0.9  # smaller cells can't be read
+_LEAST_STEP: Final = 4.0  # grey levels between a dark square and the mean around its edge
 _NOISY: Final = 2.5  # grey levels: images with more noise are smoothed before the search
 _SHARPENING: Final = 0.25  # of cells against their neighbours, because blur mixes them
 _LEAST_CONTRAST: Final = 8.0  # grey levels between black and white
@@ -31,11 +32,13 @@ _BORDER_ERRORS: Final = 0.25  # largest fraction of the border's cells that are 
 _CORRECTED: Final = 0.6  # fraction of a dictionary's correctable bits that are corrected (OpenCV's default)
 _ITERATIONS: Final = 10
 _MOST_UNEXPLAINED: Final = 0.05  # fraction of the brightness's variance, besides noise
+# Blur added to the image, because steps from one pixel to the next have no slope to follow: in cells, and at most [px].
+_SOFTER, _MOST_SOFTER_PX = 0.1, 0.6
 _LEAST_SIGMA_PX: Final = 0.02  # of a corner: lenses and prints are no better known
-_SETTLED: Final = 0.01  # of a cell: smaller steps end the fit
+_SETTLED: Final = 0.004  # of a cell: smaller steps end the fit
 _MOST_ROWS: Final = 32_000  # of samples that OpenCV takes at once
 _ENDS: Final = np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-_MOST_SAMPLES: Final = 8  # per cell
+_MOST_SAMPLES: Final = 10  # per cell
 
 
 class Codes:
@@ -76,7 +79,7 @@ class QuadFinder:
         self.noise = 0.0  #: standard deviation of the last image's noise, in grey levels
         self._parameters = parameters = cv.aruco.DetectorParameters()
         # One window suffices, because only the outer edge of the border counts.
-        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 13
+        parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = 23
         parameters.polygonalApproxAccuracyRate = 0.04  # small and tilted markers have few pixels for each corner
         # The white card's edge is another square near the marker's, which must not hide it.
         parameters.minMarkerDistanceRate = parameters.minGroupDistance = 0.0
@@ -90,7 +93,7 @@ class QuadFinder:
         self.noise = noise = _noise(grey)
         if noise > _NOISY:  # noise makes thousands of contours
             grey, noise = self._cv.GaussianBlur(grey, (3, 3), 0), 0.375 * noise
-        wanted = (max(grey.shape), 7.0 if noise < _NOISY else max(7.0, round(1.3 * noise)))
+        wanted = (max(grey.shape), max(_LEAST_STEP, round(1.3 * noise)))
         if wanted != self._set:
             self._set = wanted
             self._parameters.minMarkerPerimeterRate = self._least_px / wanted[0]
@@ -108,7 +111,7 @@ def _noise(grey: NDArray[np.uint8]) -> float:
     return float(np.median(np.abs(rows[:, 2:] - 2 * rows[:, 1:-1] + rows[:, :-2]))) / (0.6745 * math.sqrt(6.0))
 
 
-def line_quads(cv: Any, image: NDArray[Any], quads: Array, cells: int) -> Array:
+def line_quads(cv: Any, image: NDArray[Any], quads: Array, cells: int, *, close: bool = False) -> Array:
     """Return quadrilaterals (m, 4, 2), clockwise, with corners where lines fitted to their edges meet.
 
     Args:
@@ -116,13 +119,15 @@ def line_quads(cv: Any, image: NDArray[Any], quads: Array, cells: int) -> Array:
         image: Grey, (h, w).
         quads: Rough quadrilaterals around dark squares, clockwise.
         cells: Number of cells of a side, which limits the search to the border's cells.
+        close: Whether the lines are near already.
     """
     way = np.roll(quads, -1, axis=1) - quads
     length = np.maximum(np.linalg.norm(way, axis=2, keepdims=True), 1e-6)
     out = np.stack([way[..., 1], -way[..., 0]], axis=-1) / length
     x, y = np.moveaxis(quads - np.roll(quads, 2, axis=1), 2, 0)
     area = np.abs(x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0])[:, None, None] / 2
-    reach = np.maximum(_REACH * area / length / cells, _LEAST_REACH_PX)  # (m, 4, 1), by the extent across the edge
+    share, least = _CLOSE_REACH if close else _REACH
+    reach = np.maximum(share * area / length / cells, least)  # (m, 4, 1), by the extent across the edge
     off = reach * _ACROSS  # (m, 4, across)
     on = quads[:, :, None] + _ALONG[:, None] * way[:, :, None]  # (m, 4, along, 2)
     seen = sample(cv, image, on[:, :, :, None] + (off[..., None] * out[:, :, None])[:, :, None])
@@ -239,6 +244,7 @@ def fit_pattern(
     """
     cell_px = math.sqrt(max(1e-6, abs(cv.contourArea(corners.astype(np.float32))))) / len(pattern)
     per_cell = int(np.clip(math.ceil(cell_px), 4, _MOST_SAMPLES))
+    softer_px = max(min(_SOFTER * cell_px, _MOST_SOFTER_PX), 0.4 * cell_px / per_cell)
     template = _Template(pattern, per_cell)
     u, v, ones = template.u, template.v, np.ones_like(template.u)
     points = np.stack([u, v, ones], axis=1)
@@ -251,7 +257,7 @@ def fit_pattern(
         if not np.isfinite(where).all():
             return None
         if part is None:
-            part, origin = _around(cv, image, where, cell_px / per_cell)
+            part, origin = _around(cv, image, where, softer_px)
             if part is None:
                 return None
         seen = sample(cv, part, where - origin).astype(np.float64)
@@ -275,10 +281,12 @@ def fit_pattern(
         most = float(np.abs(change).max()) * len(pattern) / 2
         shape = shape @ np.linalg.inv(np.eye(3) + change * min(1.0, 0.5 / max(most, 1e-9)))
         shape /= shape[2, 2]
-        blur = _bounded(blur + np.array([[found[8], found[10]], [found[10], found[9]]]), 0.4 / per_cell)
+        blur = _bounded(
+            blur + np.array([[found[8], found[10]], [found[10], found[9]]]), max(softer_px / cell_px, 0.4 / per_cell)
+        )
         if step >= 2 and most < _SETTLED:
             break
-        if step >= 1:  # glare, dirt and shadows count less
+        if 1 <= step <= 2:  # glare, dirt and shadows count less
             deviation = 1.4826 * float(np.median(np.abs(left))) + 0.5
             weight = 1.0 / (1.0 + (left / (4.0 * deviation)) ** 2)
     flat = _ENDS @ shape.T
@@ -298,8 +306,8 @@ def fit_pattern(
     return PatternFit(fitted, turned @ covariance @ turned.T + least * np.eye(8))
 
 
-def _around(cv: Any, image: NDArray[Any], where: Array, spacing_px: float) -> tuple[Any, Any]:
-    """Return the part of an image around points, as float32, and its first pixel; None if they are not in it."""
+def _around(cv: Any, image: NDArray[Any], where: Array, blur_px: float) -> tuple[Any, Any]:
+    """Return the blurred part of an image around points, and its first pixel; None if they are not in it."""
     height, width = image.shape
     low = np.floor(where.min(axis=0)).astype(int) - 8
     high = np.ceil(where.max(axis=0)).astype(int) + 9
@@ -307,9 +315,7 @@ def _around(cv: Any, image: NDArray[Any], where: Array, spacing_px: float) -> tu
     if (high - low < 4).any():
         return None, low
     part = image[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    if spacing_px > 1.3:  # samples are sparse: let each stand for its surroundings
-        part = cv.GaussianBlur(part, (0, 0), 0.4 * spacing_px)
-    return part, low
+    return cv.GaussianBlur(part, (0, 0), blur_px), low
 
 
 def _blurred(cv: Any, image: Pixels, covariance: Array) -> Array:

@@ -260,6 +260,7 @@ class MarkerDetector:
                 return ideal
             return project(np.column_stack([(ideal - centre) / focal, np.ones(len(ideal))]), intrinsics)
 
+        corners = line_quads(self._cv, grey, corners[None], self._codes.size + 2, close=True)[0]
         ideal = normalised(corners, intrinsics) * focal + centre
         if not np.isfinite(ideal).all():
             return None
