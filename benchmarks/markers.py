@@ -4,7 +4,7 @@ Markers of the family 36h11 are rendered by tracing rays: 8 × 8 rays a pixel, t
 then blur, motion and noise. A pixel's centre has integer coordinates, so that the first pixel reaches from -0.5 to 0.5;
 the figure *shift* is the mean error of all corners and would show another convention (about 0.5).
 
-Each row has 30 markers in images of 640×480 with random ids, places, turns and directions of tilt. Unless the row says
+A row has 30 markers in images of 640×480 with random ids, places, turns and directions of tilt. Unless the row says
 otherwise, a marker's side is 48 px when seen from the front, tilted by 20°, on a white card, and noise has a standard
 deviation of 2 (of 255). The error of a marker is the mean distance of its four corners from the truth.
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -43,6 +43,7 @@ _WIDTH, _HEIGHT, _FOCAL_PX = 640, 480, 600.0
 _FINER: Final = 8  # rays per pixel and axis
 _CELLS: Final = 10  # cells per side of the card: 6 of data, the black border and the white margin
 _TURNS: Final = 9  # repetitions of a timing, of which the least counts
+_PUPIL_SHIFT_PX: Final = 0.5  # pupil-apriltags counts from the first pixel's outer corner: without this, *shift* is 0.5
 
 
 class Case(NamedTuple):
@@ -84,13 +85,6 @@ class Shown(NamedTuple):
     distance_m: float
 
 
-class Found(NamedTuple):
-    """A detected marker."""
-
-    corners: Array
-    distance_m: float
-
-
 class Score(msgspec.Struct):
     """The results of one detector in one row."""
 
@@ -103,23 +97,16 @@ class Score(msgspec.Struct):
     shift_px: tuple[float, float]  #: mean error of all corners
 
 
-class Timing(msgspec.Struct):
-    """Processor time on one core for an image of 1280×720 without a marker."""
-
-    image: str
-    detector: str
-    ms: float
-
-
 class MarkerResults(msgspec.Struct):
     """All results."""
 
     opencv: str
     scores: list[Score]
-    timings: list[Timing]
+    ms: dict[str, dict[str, float]]  #: processor time for images of 1280×720 without a marker, by detector
 
 
-Detect = Callable[[Image, Intrinsics, int], Found | None]
+#: Returns corners and distance of a marker in an image.
+Detect = Callable[[Image, Intrinsics, int], tuple[Array, float] | None]
 
 
 def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
@@ -136,7 +123,6 @@ def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
     tilted = cv2.Rodrigues(np.array([math.cos(axis), math.sin(axis), 0.0]) * tilt)[0]
     rotation = faced @ tilted @ cv2.Rodrigues(np.array([0.0, 0.0, turn]))[0]
     corners = project(rectangle(SIZE_M, SIZE_M) @ rotation.T + place, lens)
-
     image = np.full((_HEIGHT, _WIDTH), 0.5 * (case.white + case.black))
     reach = 0.7 * np.ptp(corners, axis=0).max() + 4 * case.blur_px + case.motion_px / 2 + 4
     middle = corners.mean(axis=0)
@@ -148,22 +134,17 @@ def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
         drawn = cv2.filter2D(drawn, -1, _smear(case.motion_px * _FINER, rng.uniform(0, math.pi)))
     shape = (high[1] - low[1], _FINER, high[0] - low[0], _FINER)
     image[low[1] : high[1], low[0] : high[0]] = drawn.reshape(shape).mean(axis=(1, 3))
-    image += rng.normal(0.0, case.noise, image.shape)
-    return Shown(image.round().clip(0, 255).astype(np.uint8), lens, corners, float(np.linalg.norm(place)))
+    return Shown(_noisy(image, case.noise, rng), lens, corners, float(np.linalg.norm(place)))
 
 
-def _traced(
-    case: Case, number: int, lens: Intrinsics, pose: tuple[Array, Array], area: tuple[Any, Any]
-) -> NDArray[np.float32]:
+def _traced(case: Case, number: int, lens: Intrinsics, pose: tuple[Array, Array], area: tuple[Any, Any]) -> Any:
     """Return the brightness along the rays of an area."""
     (left, top), (right, bottom) = area
     across = (np.arange((right - left) * _FINER) + 0.5) / _FINER - 0.5 + left
     down = (np.arange((bottom - top) * _FINER) + 0.5) / _FINER - 0.5 + top
     pixels = np.stack(np.meshgrid(across, down), axis=-1)
-    if lens.distortion:
-        flat = normalised(pixels.reshape(-1, 2), lens).reshape(pixels.shape)
-    else:
-        flat = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    straight = (pixels - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+    flat = normalised(pixels.reshape(-1, 2), lens).reshape(pixels.shape) if lens.distortion else straight
     rotation, place = pose
     # The face's plane: position + x·right + y·up; solved for x and y of each ray.
     inverse = np.linalg.inv(np.column_stack([rotation[:, :2], place]))
@@ -206,46 +187,39 @@ def empty_images() -> Iterator[tuple[str, Image]]:
 
 
 def _noisy(image: Array, deviation: float, rng: np.random.Generator) -> Image:
-    return (image + rng.normal(0, deviation, image.shape)).round().clip(0, 255).astype(np.uint8)
+    return np.asarray((image + rng.normal(0, deviation, image.shape)).round().clip(0, 255), np.uint8)
 
 
 def detectors() -> dict[str, Detect]:
     """Return the detectors by name."""
     ours = MarkerDetector(FAMILY, SIZE_M)
 
-    def by_ours(image: Image, lens: Intrinsics, number: int) -> Found | None:
-        seen = next((one for one in ours.detect(image, lens) if one.id == number), None)
-        return None if seen is None else Found(seen.corners, seen.distance_m)
+    def by_ours(image: Image, lens: Intrinsics, number: int) -> tuple[Array, float] | None:
+        return next(((one.corners, one.distance_m) for one in ours.detect(image, lens) if one.id == number), None)
 
-    found: dict[str, Detect] = {OURS: by_ours}
     try:
         import pupil_apriltags
     except ImportError:
         print(f"without {OTHER}: it is not installed")
-        return found
+        return {OURS: by_ours}
     other = pupil_apriltags.Detector(families="tag36h11", nthreads=1, quad_decimate=1.0)
 
-    def by_other(image: Image, lens: Intrinsics, number: int) -> Found | None:
-        seen = next((one for one in other.detect(image) if one.tag_id == number), None)
-        if seen is None:
-            return None
-        corners = np.asarray(seen.corners, dtype=np.float64) - PUPIL_SHIFT_PX
-        rays = normalised(corners[::-1], lens)
-        place = cv2.solvePnP(rectangle(SIZE_M, SIZE_M), rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE)[2]
-        return Found(corners[::-1], float(np.linalg.norm(place)))
+    def by_other(image: Image, lens: Intrinsics, number: int) -> tuple[Array, float] | None:
+        for one in other.detect(image):
+            if one.tag_id == number:
+                corners = np.asarray(one.corners, dtype=np.float64)[::-1] - _PUPIL_SHIFT_PX
+                square, rays = rectangle(SIZE_M, SIZE_M), normalised(corners, lens)
+                place = cv2.solvePnP(square, rays, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE)[2]
+                return corners, float(np.linalg.norm(place))
+        return None
 
-    return {**found, OTHER: by_other}
-
-
-#: Coordinates of pupil-apriltags begin at the first pixel's corner, not at its centre (see *shift* without it).
-PUPIL_SHIFT_PX: Final = 0.5
+    return {OURS: by_ours, OTHER: by_other}
 
 
 def measure(shown: int, report: Callable[[str], None]) -> MarkerResults:
     """Measure all detectors; ``shown`` is the number of markers in each row."""
     cv2.setNumThreads(1)
-    by_name = detectors()
-    scores = []
+    scores, by_name = [], detectors()
     for at, case in enumerate(CASES):
         report(f"{at + 1} of {len(CASES)}: {case.name}")
         rng = np.random.default_rng(at)
@@ -253,31 +227,32 @@ def measure(shown: int, report: Callable[[str], None]) -> MarkerResults:
         images = [show(case, number, rng) for number in numbers]
         for name, detect in by_name.items():
             found = [detect(one.image, one.intrinsics, number) for one, number in zip(images, numbers, strict=True)]
-            scores.append(_score(case.name, name, list(zip(images, found, strict=True))))
-    timings = []
+            scores.append(_score(case.name, name, zip(images, found, strict=True)))
+    times = {}
     for what, image in empty_images():
         report(f"time: {what}")
-        lens = Intrinsics(1000.0, 1000.0, 639.5, 359.5)
-        timings += [Timing(what, name, _least_ms(detect, image, lens)) for name, detect in by_name.items()]
-    return MarkerResults(cv2.__version__, scores, timings)
+        times[what] = {name: _least_ms(detect, image) for name, detect in by_name.items()}
+    return MarkerResults(cv2.__version__, scores, times)
 
 
-def _score(case: str, name: str, seen: Sequence[tuple[Shown, Found | None]]) -> Score:
-    errors, ranges, shifts = [], [], []
+def _score(case: str, name: str, seen: Iterable[tuple[Shown, tuple[Array, float] | None]]) -> Score:
+    shown, errors, ranges, shifts = 0, [], [], []
     for truth, found in seen:
+        shown += 1
         if found is None:
             continue
+        corners, distance_m = found
         # A library's first corner is its own affair: the nearest of the four turns counts.
-        turned = min((np.roll(found.corners, n, axis=0) - truth.corners for n in range(4)), key=lambda d: (d**2).sum())
+        turned = min((np.roll(corners, n, axis=0) - truth.corners for n in range(4)), key=lambda d: (d**2).sum())
         errors.append(float(np.linalg.norm(turned, axis=1).mean()))
-        ranges.append(abs(found.distance_m / truth.distance_m - 1.0))
+        ranges.append(abs(distance_m / truth.distance_m - 1.0))
         shifts.append(turned.mean(axis=0))
     across, down = np.mean(shifts, axis=0) if shifts else (math.nan, math.nan)
-    return Score(case, name, len(seen), len(errors), errors, ranges, (float(across), float(down)))
+    return Score(case, name, shown, len(errors), errors, ranges, (float(across), float(down)))
 
 
-def _least_ms(detect: Detect, image: Image, lens: Intrinsics) -> float:
-    times = []
+def _least_ms(detect: Detect, image: Image) -> float:
+    times, lens = [], Intrinsics(1000.0, 1000.0, 639.5, 359.5)
     for _ in range(_TURNS):
         began = time.process_time_ns()
         detect(image, lens, 0)
@@ -293,13 +268,9 @@ def tables(results: MarkerResults) -> tuple[Table, Table]:
         cells.setdefault(score.case, []).extend(_cells(score))
     columns = [f"{name}: {what}" for name in names for what in ("found", "error, px", "range, %", "shift, px")]
     rows = [[case, *texts] for case, texts in cells.items()]
-    times: dict[str, list[str]] = {}
-    for one in results.timings:
-        times.setdefault(one.image, []).append(f"{one.ms:.1f}")
-    return (
-        Table("Corners: median (90th percentile)", ["marker", *columns], rows),
-        Table("1280×720 without a marker, ms on one core", ["image", *names], [[w, *ms] for w, ms in times.items()]),
-    )
+    times = [[image, *(f"{by[name]:.1f}" for name in names)] for image, by in results.ms.items()]
+    corners = Table("Corners: median (90th percentile)", ["marker", *columns], rows)
+    return corners, Table("1280×720 without a marker, ms on one core", ["image", *names], times)
 
 
 def _cells(score: Score) -> list[str]:
@@ -307,20 +278,13 @@ def _cells(score: Score) -> list[str]:
     if not score.found:
         return [found, UNKNOWN, UNKNOWN, UNKNOWN]
     error, ninth = np.percentile(score.errors_px, (50, 90))
-    across, down = score.shift_px
-    return [
-        found,
-        f"{error:.3f} ({ninth:.2f})",
-        f"{100 * float(np.median(score.range_errors)):.2f}",
-        f"{across:+.2f} {down:+.2f}",
-    ]
+    (across, down), off = score.shift_px, f"{100 * float(np.median(score.range_errors)):.2f}"
+    return [found, f"{error:.3f} ({ninth:.2f})", off, f"{across:+.2f} {down:+.2f}"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print the tables, and write the figures as JSON."""
-    parser = argparse.ArgumentParser(
-        prog="benchmarks.markers", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(prog="benchmarks.markers", description=__doc__)
     parser.add_argument("--output", type=Path, help="folder for markers.json")
     parser.add_argument("--shown", type=int, default=30, help="markers in each row [default: 30]")
     options = parser.parse_args(arguments)

@@ -37,7 +37,7 @@ def test_a_square_shows_the_convention_by_its_centre_of_brightness() -> None:
 def test_the_table_has_a_row_for_each_case() -> None:
     score = markers.Score("side 12 px", markers.OURS, 30, 2, [0.1, 0.2], [0.001, 0.002], (0.01, -0.02))
     missed = markers.Score("side 24 px", markers.OURS, 30, 0, [], [], (float("nan"), float("nan")))
-    results = markers.MarkerResults("5", [score, missed], [markers.Timing("wall", markers.OURS, 3.21)])
+    results = markers.MarkerResults("5", [score, missed], {"wall": {markers.OURS: 3.21}})
     corners, times = markers.tables(results)
     assert corners.rows == [
         ["side 12 px", "2/30", "0.150 (0.19)", "0.15", "+0.01 -0.02"],

@@ -288,9 +288,7 @@ class LandOnMarker(Behaviour):
     def look(self, frame: Frame) -> list[Shape]:
         """Detect the marker and update the control law."""
         law = self._landing_law
-        mine = next(
-            (one for one in self._detector.detect(frame, camera=self._mounting) if one.id == self.marker_id), None
-        )
+        mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None:
             return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), SEARCHING)]
         if frame.feedback is not None:

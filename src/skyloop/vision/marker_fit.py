@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +30,7 @@ _LEAST_CONTRAST: Final = 8.0  # grey levels between black and white
 _BORDER_ERRORS: Final = 0.25  # largest fraction of the border's cells that are not black
 _CORRECTED: Final = 0.6  # fraction of a dictionary's correctable bits that are corrected (OpenCV's default)
 _ITERATIONS: Final = 10
-_MOST_UNEXPLAINED: Final = 0.05  # fraction of the brightness's variance, besides noise
+_MOST_UNEXPLAINED: Final = 0.025  # fraction of the brightness's variance, besides noise
 # Blur added to the image, because steps from one pixel to the next have no slope to follow: in cells, and at most [px].
 _SOFTER, _MOST_SOFTER_PX = 0.1, 0.6
 _LEAST_SIGMA_PX: Final = 0.02  # of a corner: lenses and prints are no better known
@@ -96,7 +95,7 @@ class QuadFinder:
         wanted = (max(grey.shape), max(_LEAST_STEP, round(1.3 * noise)))
         if wanted != self._set:
             self._set = wanted
-            self._parameters.minMarkerPerimeterRate = self._least_px / wanted[0]
+            self._parameters.minMarkerPerimeterRate = min(self._least_px / wanted[0], 3.9)  # below OpenCV's maximum
             self._parameters.adaptiveThreshConstant = wanted[1]
             self._detector.setDetectorParameters(self._parameters)
         quads, _, others = self._detector.detectMarkers(grey)
@@ -186,14 +185,6 @@ def read(cv: Any, image: NDArray[Any], quads: Array, codes: Codes) -> list[tuple
     return kept_markers
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PatternFit:
-    """A pattern aligned with the image."""
-
-    corners: Array  #: (4, 2) in the plane of an ideal camera [px]
-    covariance: Array  #: of the corners, (8, 8): x and y of the first, of the second … [px²]
-
-
 class _Template:
     """A pattern drawn with some samples per cell, which are compared with the image."""
 
@@ -231,8 +222,8 @@ def fit_pattern(
     pattern: NDArray[np.bool_],
     to_pixels: Callable[[Array], Array],
     noise: float,
-) -> PatternFit | None:
-    """Align a marker's pattern with the image; None if it does not explain the image, for example in a sharp shadow.
+) -> tuple[Array, Array] | None:
+    """Align a marker's pattern with the image, and return its corners and their covariance.
 
     Args:
         cv: OpenCV.
@@ -241,6 +232,13 @@ def fit_pattern(
         pattern: The cells with the black border, true where white.
         to_pixels: Turns points (n, 2) of that plane into pixels.
         noise: Standard deviation of the image's noise, in grey levels.
+
+    Returns:
+        Corners (4, 2) in the plane of the ideal camera [px], and covariance (8, 8) of x and y of the first, of the
+        second … [px²]; None if the pattern does not explain the image, for example because of a sharp shadow.
+
+    Raises:
+        numpy.linalg.LinAlgError: The image leaves the corners undetermined.
     """
     cell_px = math.sqrt(max(1e-6, abs(cv.contourArea(corners.astype(np.float32))))) / len(pattern)
     per_cell = int(np.clip(math.ceil(cell_px), 4, _MOST_SAMPLES))
@@ -272,10 +270,7 @@ def fit_pattern(
         normal = trusted.T @ rows
         normal[range(8, 11), range(8, 11)] *= 1.05  # the blur settles more slowly, and matters less
         left = seen - light @ shade
-        try:
-            found = np.linalg.solve(normal, trusted.T @ left)
-        except np.linalg.LinAlgError:
-            return None
+        found = np.linalg.solve(normal, trusted.T @ left)
         left -= rows @ found
         change = np.array([found[0:3], found[3:6], [found[6], found[7], 0.0]])
         most = float(np.abs(change).max()) * len(pattern) / 2
@@ -300,10 +295,11 @@ def fit_pattern(
     moves = [([x, y, 1, 0, 0, 0, -x * x, -x * y], [0, 0, 0, x, y, 1, -x * y, -y * y]) for x, y, _ in _ENDS]
     slope = (shape[:2, :2] - fitted[:, :, None] * shape[2, :2]) / flat[:, 2, None, None]
     turned = (slope @ np.array(moves)).reshape(8, 8)
-    # A Gaussian is not the true blur, which matters once it reaches the next cell (measured by benchmarks.markers).
+    # Systematic errors: the true blur is no Gaussian, which matters once it reaches the next cell, and a soft shadow
+    # moves corners by about the unexplained fraction of a cell (both measured by benchmarks.markers).
     spread = float(np.linalg.eigvalsh(blur)[-1]) ** 1.5
-    least = _LEAST_SIGMA_PX**2 + (0.15 * cell_px * spread) ** 2
-    return PatternFit(fitted, turned @ covariance @ turned.T + least * np.eye(8))
+    least = _LEAST_SIGMA_PX**2 + (0.15 * cell_px * spread) ** 2 + (cell_px * max(0.0, unexplained)) ** 2
+    return fitted, turned @ covariance @ turned.T + least * np.eye(8)
 
 
 def _around(cv: Any, image: NDArray[Any], where: Array, blur_px: float) -> tuple[Any, Any]:

@@ -231,7 +231,8 @@ class MarkerDetector:
     def _read(self, grey: NDArray[np.uint8], quads: Array, codes: Codes) -> list[tuple[int, Array]]:
         if not len(quads):
             return []
-        return read_markers(self._cv, grey, line_quads(self._cv, grey, quads, codes.size + 2), codes)
+        with np.errstate(all="ignore"):  # some quadrilaterals are so flat that they have no homography
+            return read_markers(self._cv, grey, line_quads(self._cv, grey, quads, codes.size + 2), codes)
 
     def _look_for_others(self, grey: NDArray[np.uint8], quads: Array) -> None:
         """Search for markers of another family, choosing a different family each time."""
@@ -264,10 +265,14 @@ class MarkerDetector:
         ideal = normalised(corners, intrinsics) * focal + centre
         if not np.isfinite(ideal).all():
             return None
-        fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels, self._finder.noise)
         covariance = np.eye(8) * _LINES_SIGMA_PX**2
-        if fit is not None:
-            ideal, covariance, corners = fit.corners, fit.covariance, to_pixels(fit.corners)
+        try:
+            fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels, self._finder.noise)
+        except np.linalg.LinAlgError:
+            fit = None
+        if fit is not None and all(np.isfinite(each).all() for each in fit):
+            ideal, covariance = fit
+            corners = to_pixels(ideal)
         scale = np.tile(focal, 4)
         rays = (ideal - centre) / focal
         poses = solutions(self._cv, self._square, rays, covariance / np.outer(scale, scale))
