@@ -285,7 +285,7 @@ class FollowMarker(Behaviour):
 
     def look(self, frame: Frame) -> list[Shape]:
         """Detect the marker, update the control law and count the frame."""
-        seen = self._detector.detect(frame)
+        seen = self._detector.detect(frame, camera=self._mounting)
         mine = next((one for one in seen if one.id == self.marker_id), None)
         self.score.count(frame.captured_ns, None if mine is None else self._use(mine, frame))
         return self._drawing(frame, seen, mine)

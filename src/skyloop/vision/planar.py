@@ -2,9 +2,10 @@
 
 Camera axes are optical: x right, y down, z forward. A flat object's own axes are x right, y up, z out of its face.
 
-Markers are detected by OpenCV's ``ArucoDetector`` (Garrido-Jurado et al., "Automatic generation and detection of highly
-reliable fiducial markers under occlusion", Pattern Recognition 47(6), 2014); the pose is IPPE for squares (Collins and
-Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
+Candidates for markers are found by OpenCV's ``ArucoDetector`` (Garrido-Jurado et al., "Automatic generation and
+detection of highly reliable fiducial markers under occlusion", Pattern Recognition 47(6), 2014), and read and fitted by
+:mod:`skyloop.vision.marker_fit`; poses are both solutions of IPPE for squares (Collins and Bartoli, "Infinitesimal
+Plane-Based Pose Estimation", IJCV 109, 2014), refined with the corners' covariance.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Intrinsics
 from skyloop.poses import mounting_rotation, transform
-from skyloop.vision.lens import Array, checked, normalised
+from skyloop.vision.lens import Array, checked, normalised, project
+from skyloop.vision.marker_fit import Codes, QuadFinder, fit_pattern, line_quads
+from skyloop.vision.marker_fit import read as read_markers
+from skyloop.vision.marker_pose import PoseChoice, solutions
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 if TYPE_CHECKING:
@@ -117,7 +121,8 @@ _FAMILIES: Final = (
     *("apriltag_16h5", "apriltag_25h9", "apriltag_36h10", "apriltag_36h11", "aruco_mip_36h12"),
 )
 _SIZES: Final = (50, 100, 250, 1000)
-_OTHERS_EVERY: Final = 8  #: images between attempts (about 2 ms each at 320×240), made until a marker is found
+_OTHERS_EVERY: Final = 8  #: images between attempts, made until a marker is found
+_LINES_SIGMA_PX: Final = 0.2  #: standard deviation of corners whose pattern could not be fitted
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
@@ -126,6 +131,13 @@ class MarkerSighting(PlanarSighting):
     """One marker in one image. Its top-left corner matches that of the printed marker."""
 
     id: int
+    error_px: float  #: root mean square distance between the corners and those of the pose
+    #: Covariance of the pose, (6, 6): of ``position_m`` [m], then of a small rotation vector [rad] that is applied
+    #: after ``rotation``; both along the camera's optical axes. Covers noise and blur, not a wrong lens or ``size_m``.
+    covariance: Array
+    #: The other pose that a square allows, and its ``error_px``; None if there is only one. Distinguishing them takes
+    #: perspective, which small markers seen nearly from the front hardly show.
+    other: tuple[Array, Array, float] | None  #: position (3,) [m], rotation (3, 3), error [px]
 
 
 class MarkerDetector:
@@ -153,11 +165,14 @@ class MarkerDetector:
         self.dictionary = dictionary
         self.size_m = float(size_m)
         self._cv = opencv("marker detection")
-        self._detector = _make_detector(self._cv, dictionary)
+        self._codes = Codes(marker_dictionary(self._cv, dictionary))
+        self._finder = QuadFinder(self._cv, self._codes.size + 2)
         # The order and axes that SOLVEPNP_IPPE_SQUARE expects: x right, y up, z out of the face.
         self._square = rectangle(self.size_m, self.size_m)
         self._images = self._seen = 0
         self._others: Counter[tuple[str, int]] = Counter()  # count of tags from other dictionaries, by family and id
+        self._other_codes: dict[str, Codes] = {}
+        self._choices: dict[int, PoseChoice] = {}
 
     def why_nothing(self) -> str:
         """Explain why no marker was found.
@@ -175,12 +190,23 @@ class MarkerDetector:
         tags = ", ".join(f"{number} of {_smallest(family, number)}" for family, number in sorted(self._others))
         return f"{nothing}, but markers of other dictionaries were: {tags}"
 
-    def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[MarkerSighting]:
+    def detect(
+        self,
+        image: NDArray[np.uint8],
+        intrinsics: Intrinsics | None = None,
+        *,
+        camera: CameraInfo | None = None,
+    ) -> list[MarkerSighting]:
         """Detect all markers in an image.
+
+        A square has two poses that fit nearly equally well. In a series of frames, the one that also fits the earlier
+        frames is chosen; a single image gets the one that fits best.
 
         Args:
             image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
             intrinsics: Intrinsics of the camera; defaults to the frame's own.
+            camera: With its mounting, the frame's attitude separates the camera's own turns from the marker's, so that
+                the choice between the two poses is surer.
 
         Returns:
             The sightings, ordered by id.
@@ -190,56 +216,98 @@ class MarkerDetector:
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
-        quads, ids, _ = self._detector.detectMarkers(grey)
+        quads = self._finder.find(grey)
+        read = self._read(grey, quads, self._codes)
         self._images += 1
-        if ids is None:
+        if not read:
             if not self._seen and self._images % _OTHERS_EVERY == 0:
-                self._look_for_others(grey)
+                self._look_for_others(grey, quads)
             return []
         self._seen += 1
-        found = [
-            self._sighting(int(number), np.asarray(quad, dtype=np.float64).reshape(4, 2), intrinsics)
-            for number, quad in zip(np.ravel(ids), quads, strict=True)
-        ]
+        at_ns, turn = getattr(image, "captured_ns", None), _camera_turn(image, camera)
+        found = [self._sighting(grey, number, corners, intrinsics, at_ns, turn) for number, corners in read]
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
-    def _look_for_others(self, grey: NDArray[np.uint8]) -> None:
+    def _read(self, grey: NDArray[np.uint8], quads: Array, codes: Codes) -> list[tuple[int, Array]]:
+        if not len(quads):
+            return []
+        with np.errstate(all="ignore"):  # some quadrilaterals are so flat that they have no homography
+            return read_markers(self._cv, grey, line_quads(self._cv, grey, quads, codes.size + 2), codes)
+
+    def _look_for_others(self, grey: NDArray[np.uint8], quads: Array) -> None:
         """Search for markers of another family, choosing a different family each time."""
         known = {name for name in dir(self._cv.aruco) if name.startswith("DICT_")}
         families = [family for family in _FAMILIES if f"DICT_{family.upper()}" in known]
         family = families[self._images // _OTHERS_EVERY % len(families)]
-        parameters = self._cv.aruco.DetectorParameters()
-        parameters.errorCorrectionRate = 0.0  # prevents a square object in the room from being mistaken for a tag
-        markers = marker_dictionary(self._cv, family)
-        _, ids, _ = self._cv.aruco.ArucoDetector(markers, parameters).detectMarkers(grey)
-        self._others.update((family, int(number)) for number in (() if ids is None else np.ravel(ids)))
+        # Without correction, so that a square object in the room is not mistaken for a tag.
+        if family not in self._other_codes:
+            self._other_codes[family] = Codes(marker_dictionary(self._cv, family), corrected=0.0)
+        self._others.update((family, number) for number, _ in self._read(grey, quads, self._other_codes[family]))
 
-    def _sighting(self, number: int, corners: Array, intrinsics: Intrinsics) -> MarkerSighting | None:
+    def _sighting(
+        self,
+        grey: NDArray[np.uint8],
+        number: int,
+        corners: Array,
+        intrinsics: Intrinsics,
+        at_ns: int | None,
+        turn: Array,
+    ) -> MarkerSighting | None:
         """Return the marker's pose; None if no square in front of the camera fits the corners."""
-        rays = normalised(corners, intrinsics)
-        if not np.isfinite(rays).all():
+        focal, centre = np.array([intrinsics.fx, intrinsics.fy]), np.array([intrinsics.cx, intrinsics.cy])
+
+        def to_pixels(ideal: Array) -> Array:
+            if intrinsics.model == "pinhole" and not any(intrinsics.distortion):
+                return ideal
+            return project(np.column_stack([(ideal - centre) / focal, np.ones(len(ideal))]), intrinsics)
+
+        corners = line_quads(self._cv, grey, corners[None], self._codes.size + 2, close=True)[0]
+        ideal = normalised(corners, intrinsics) * focal + centre
+        if not np.isfinite(ideal).all():
             return None
-        pose = PlanarPose.of(self._cv, self._square, rays, self._cv.SOLVEPNP_IPPE_SQUARE)
-        if pose is None:
+        covariance = np.eye(8) * _LINES_SIGMA_PX**2
+        try:
+            fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels, self._finder.noise)
+        except np.linalg.LinAlgError:
+            fit = None
+        if fit is not None and all(np.isfinite(each).all() for each in fit):
+            ideal, covariance = fit
+            corners = to_pixels(ideal)
+        scale = np.tile(focal, 4)
+        rays = (ideal - centre) / focal
+        poses = solutions(self._cv, self._square, rays, covariance / np.outer(scale, scale))
+        if not poses:
             return None
+        best = 0
+        if at_ns is not None:
+            choice = self._choices.setdefault(number, PoseChoice())
+            best = choice.choose([pose.cost for pose in poses], [turn @ pose.rotation[:, 2] for pose in poses], at_ns)
+        pose, *others = poses[best], *poses[:best], *poses[best + 1 :]
+        errors = [one.error * intrinsics.fx for one in (pose, *others)]
         return MarkerSighting(
-            id=number, corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity
+            id=number,
+            corners=corners,
+            position_m=pose.position,
+            rotation=pose.rotation,
+            ambiguity=min(1.0, errors[0] / max(errors[1], 1e-9)) if others else 0.0,
+            error_px=errors[0],
+            covariance=pose.covariance,
+            other=(others[0].position, others[0].rotation, errors[1]) if others else None,
         )
+
+
+def _camera_turn(image: Any, camera: CameraInfo | None) -> Array:
+    """Return the rotation from optical to world axes when the image was taken; the identity while it is unknown."""
+    feedback = getattr(image, "feedback", None)
+    if camera is None or camera.rotation is None or feedback is None:
+        return np.eye(3)
+    try:
+        return np.asarray(feedback.rotation @ mounting_rotation(camera))
+    except ValueError:  # the attitude is unknown
+        return np.eye(3)
 
 
 def _smallest(family: str, number: int) -> str:
     """Return the smallest dictionary of a family that contains a marker."""
     kind, _, size = family.rpartition("_")
     return f"{kind}_{next(one for one in _SIZES if number < one)}" if size == "1000" else family
-
-
-def _make_detector(cv: Any, dictionary: str) -> Any:
-    markers = marker_dictionary(cv, dictionary)
-    parameters = cv.aruco.DetectorParameters()
-    # Refine corners to a fraction of a pixel, because a marker's range is only as accurate as its edges.
-    parameters.cornerRefinementMethod = cv.aruco.CORNER_REFINE_SUBPIX
-    # Half a cell each way gives corner errors of 0.31 px (median of 150 noisy poses); OpenCV's 0.3 gives 0.46 px.
-    parameters.relativeCornerRefinmentWinSize = 0.5
-    # The white card's edge is another square near the marker's; with OpenCV's 0.125 it can hide the marker.
-    parameters.minMarkerDistanceRate = 0.05
-    return cv.aruco.ArucoDetector(markers, parameters)
