@@ -58,7 +58,11 @@ CLIENT_PORT = 19850
 MOST_INSTANCES: Final = 10
 SLOW_EVERY: Final = 20  #: number of steps between readings of the magnetometer, and of the barometer
 POSE_EVERY: Final = 10  #: number of steps between positions
-BURST_S: Final = 0.003  #: time on which late steps catch up at once: the firmware keeps five unread packets
+BURST_S: Final = 0.003  #: time on which late steps catch up at once
+#: The firmware keeps five unread packets and loses more. With more than this number of packets sent since its last
+#: answer, it gets no other one until it answers, or until this time has passed.
+MOST_UNREAD: Final = 2
+RETRY_S: Final = 0.005
 #: Time allowed for the first reply after startup, which normally takes 0.2 s, and its limit: it grows by half with each
 #: failed start in case the computer is busy.
 ANSWER_S: Final = 1.0
@@ -149,7 +153,8 @@ class Crazyflie(CoupledFirmware):
         self._link: tuple[socket.socket, Peer] | None = None  # to the one that has
         self._patience_s = ANSWER_S
         self._pace = Pace(BURST_S)
-        self._keeps_up = True  # whether it has read what it was sent
+        self._unread = 0  # number of packets sent since its last answer
+        self._sent_s = 0.0
         self._step = 0
 
     @property
@@ -198,7 +203,7 @@ class Crazyflie(CoupledFirmware):
             before[0].close()
 
     def _begin(self) -> None:
-        self._step = 0  # the client stays: it is told nothing, as by a vehicle that restarts
+        self._step = self._unread = 0  # the client stays: it is told nothing, as by a vehicle that restarts
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  no reply is owed: it runs in real time
         commands: Commands | None = None
@@ -213,26 +218,28 @@ class Crazyflie(CoupledFirmware):
                 commands = decode_motors(packet)
             elif packet[0] >> 4 != SIMULATOR >> 4:
                 self._answer(packet)
-        self._keeps_up = commands is not None or self._answered_s is None
+        if commands is not None:
+            self._unread = 0
         return commands
 
     def _send(self, readings: Readings) -> None:
         self._pace.keep()
-        if self._link is None:
-            return
+        if self._link is None or (self._unread > MOST_UNREAD and time.monotonic() < self._sent_s + RETRY_S):
+            return  # it does not keep up: what it can't keep is lost
+        if self._unread == 0:
+            step, self._step = self._step % SLOW_EVERY, self._step + 1
+            if step == 0:
+                self._tell(encode_magnetic(readings))
+            elif step == SLOW_EVERY // 2:
+                self._tell(encode_air(readings))
+            elif step % POSE_EVERY == 1 and self._position:
+                self._tell(encode_pose(readings))
+            elif self._answered_s is not None:
+                self._relay()
         self._tell(encode_inertial(readings))
-        step, self._step = self._step % SLOW_EVERY, self._step + 1
-        if step == 0:
-            self._tell(encode_magnetic(readings))
-        elif step == SLOW_EVERY // 2:
-            self._tell(encode_air(readings))
-        elif step % POSE_EVERY == 1 and self._position:
-            self._tell(encode_pose(readings))
-        elif self._keeps_up:
-            self._relay()
 
     def _relay(self) -> None:
-        """Pass on one packet of the client: the firmware keeps no more than five unread, and loses the rest."""
+        """Pass on one packet of the client."""
         if self._radio is None:
             return
         try:
@@ -247,6 +254,8 @@ class Crazyflie(CoupledFirmware):
     def _tell(self, packet: bytes) -> None:
         link = self._link
         if link is not None:
+            self._unread += 1
+            self._sent_s = time.monotonic()
             with suppress(OSError):  # the firmware has just ended
                 link[0].sendto(packet, link[1])
 
