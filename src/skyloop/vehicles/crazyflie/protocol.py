@@ -67,10 +67,10 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
 
 PATIENCE_NS: Final = nanoseconds(0.25)  #: time allowed for an answer
 TRIES: Final = 20  #: number of times a request is sent
-FEW_TRIES: Final = 4  #: the same for one that somebody waits for, or that old firmware does not know
+FEW_TRIES: Final = 4  #: the same for a request with a waiting caller, or unknown to old firmware
 WINDOW: Final = 4  #: number of requests under way at once: firmware keeps few packets
 TICK_NS: Final = nanoseconds(0.02)
-HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to be heard
+HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to connect
 ALIVE_NS: Final = nanoseconds(0.5)  #: time between packets that keep a connection over UDP open
 DEGRADED_NS: Final = nanoseconds(0.5)
 LOST_NS: Final = nanoseconds(1.5)
@@ -102,7 +102,7 @@ class CrtpRequest:
 class Stage(Enum):
     """Progress of a connection."""
 
-    CALLING = auto()  #: nothing is heard
+    CALLING = auto()  #: no packet has arrived
     ASKING = auto()  #: versions and tables are being read
     LOGGING = auto()  #: log blocks are requested; their data follows
 
@@ -190,7 +190,7 @@ class CrazyflieSession(VehicleSession):
         self.due_ns = 0
 
     def _ask_first(self, packet: CrtpPacket, prefix: bytes, done: Done) -> None:
-        """Send a packet before all other requests, and not for longer than somebody waits for its answer."""
+        """Send a packet before all other requests, for as long as the caller waits for its answer."""
         self._queue.appendleft(CrtpRequest(packet, prefix, done, FEW_TRIES))
         self.due_ns = 0
 
