@@ -80,6 +80,9 @@ MAX_CONSOLE: Final = 400  #: longest line kept from the console [characters]
 POWER_OFF, POWER_ON = b"\xfe\x02", b"\xfe\x03"  #: in a null packet: switch the vehicle's main processor
 RESTART_NS: Final = nanoseconds(0.3)  #: how long it stays off
 
+#: Parameter of older firmware that switches the high-level commander on.
+HIGH_LEVEL: Final = "commander.enHighLevel"
+
 #: Called with the answer, or None if there was none.
 Done = Callable[[CrtpPacket | None], None]
 
@@ -153,6 +156,7 @@ class CrazyflieSession(VehicleSession):
         self._queue: deque[CrtpRequest] = deque()
         self._under_way: list[CrtpRequest] = []
         self._abandoned = False  # whether requests are ended rather than unanswered
+        self._enabled = False  # whether the high-level commander was switched on
         self._first: list[int] = []  # numbers of the parameters to read at once
         self._rest: list[int] = []  # numbers of the others
         self._blocks: dict[int, list[Entry]] = {}
@@ -315,6 +319,7 @@ class CrazyflieSession(VehicleSession):
         self._unreachable = ""
         self._log, self.parameters = Table(CrtpPort.LOG), Table(CrtpPort.PARAMETERS)
         self.values.clear()
+        self._enabled = False
         self.due_ns = 0
         for query in VersionQuery:
             self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), FEW_TRIES)
@@ -368,7 +373,7 @@ class CrazyflieSession(VehicleSession):
 
     def _on_complete(self, table: Table) -> None:
         if table is self.parameters:
-            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR}
+            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR, HIGH_LEVEL}
             ordered = sorted(table.entries.values(), key=lambda entry: entry.full_name not in wanted)
             self._first = [entry.number for entry in ordered if entry.full_name in wanted]
             self._rest = [entry.number for entry in ordered if entry.full_name not in wanted]
@@ -402,6 +407,9 @@ class CrazyflieSession(VehicleSession):
         value = self.values[number] = entry.type.decode(data[: entry.type.size])
         if entry.full_name in (*DECKS, *RANGE_FINDERS, ESTIMATOR):
             self.telemetry.parameters[entry.full_name] = value
+        elif entry.full_name == HIGH_LEVEL and not value and not self._enabled:
+            self._enabled = True
+            self.write(number, 1, _ignore)
 
     def _on_reset(self, answer: CrtpPacket | None) -> None:
         main, slow = choose_variables(list(self._log.entries.values()))
@@ -535,3 +543,7 @@ class CrazyflieSession(VehicleSession):
                 "switch the vehicle on; check channel, rate and address, and that no other program uses the Crazyradio"
             )
         return "switch the vehicle on and join its Wi-Fi network; or correct the host in the address"
+
+
+def _ignore(_: CrtpPacket | None) -> None:
+    """Ignore an answer, because the parameter's value shows it."""
