@@ -72,7 +72,7 @@ RISES_NS: Final = nanoseconds(1.0)  #: time after the last take-off packet withi
 FRESH_NS: Final = nanoseconds(0.5)  #: age of the newest state within which a take-off is sent
 SILENT_NS: Final = nanoseconds(0.35)  #: silence after which low-level set-points give way to a hover
 ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
-LATE_S: Final = 3.0  #: delay of a landing after which it is sent again
+LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-off counts as finished
 NEAR_M: Final = 0.15
 SLOW_M_S: Final = 0.3
 RELAXES: Final = 3  #: how often to tell the vehicle that no more low-level set-points follow
@@ -123,7 +123,7 @@ class CrazyflieSetpoints:
         self._planned: Vector | None = None  # where short flights should have brought it
         self._height_m: float | None = None  # height that low-level set-points hold
         self._ground_m = 0.0  # height of the ground, as far as known
-        self._target_m = 0.0  # height at the end of a take-off
+        self._target_m = self._takeoff_s = 0.0  # height at the end of a take-off, and its duration
         self._place: Position | None = None  # the place of the last flight, as requested
         self._heading_rad: float | None = None  # heading to keep on flights to places
         self._rises_until_ns = 0
@@ -252,19 +252,21 @@ class CrazyflieSetpoints:
             self._planned = self._height_m = self._place = self._heading_rad = None
             if self._setpoint is not None:
                 self._moving = None
+        if setpoint is not None and setpoint != self._setpoint:
+            self._flight = None
         self._setpoint = setpoint
 
     def _decide(self, decision: Decision, now_ns: int) -> None:
         if decision is self._decision:
             return
         self._decision, self._decided_ns, self._flight = decision, now_ns, None
-        self._setpoint, self._moving, self._armed_ns, self._place = None, Velocity(), None, None
+        self._setpoint = self._moving = self._armed_ns = self._place = None
         position = self.telemetry.estimate.position_m
         if decision is Decision.TAKE_OFF and position is not None:
             self._ground_m = position[2]
             self._target_m = self._ground_m + self.limits[TAKEOFF_ALTITUDE]
-            duration_s = max(1.0, self.limits[TAKEOFF_ALTITUDE] / CLIMB_M_S)
-            self._flight = _Flight(HighLevelTakeoff(0, self._target_m, 0.0, True, duration_s))
+            self._takeoff_s = max(1.0, self.limits[TAKEOFF_ALTITUDE] / CLIMB_M_S)
+            self._flight = _Flight(HighLevelTakeoff(0, self._target_m, 0.0, True, self._takeoff_s))
         elif decision is Decision.LAND:
             self._land(now_ns)
 
@@ -331,7 +333,8 @@ class CrazyflieSetpoints:
         if self._decision is Decision.TAKE_OFF:
             if flying and estimate.position_m is not None:
                 up = estimate.position_m[2] >= self._target_m - NEAR_M
-                if up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S:
+                settled = up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S
+                if settled or now_ns - self._decided_ns > nanoseconds(self._takeoff_s + LATE_S):
                     self._decide(Decision.STAY, now_ns)
             elif rose and not flying:
                 self._give_up("the vehicle began to take off, and its motors stopped: it is not started again", now_ns)
@@ -368,7 +371,7 @@ class CrazyflieSetpoints:
         self.receiving, self._state_ns = False, None
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
-        self._setpoint, self._moving = None, Velocity()
+        self._setpoint, self._moving, self._relaxes = None, None, RELAXES
         if self._decision is not Decision.LAND:
             self._flight = None
 
