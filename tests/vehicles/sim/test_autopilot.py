@@ -77,6 +77,7 @@ def happened(sink: RecordingSink, reason: str, times: int = 1) -> bool:
         ("sim://?autopilot=ardupilo", "no autopilot of sim:// named 'ardupilo'; did you mean 'ardupilot'"),
         ("sim://?autopilot=px4&vehicle=ardrone", "firmware needs a vehicle with rotors"),
         ("sim://?autopilot=betaflight&speed=2", "Betaflight uses the computer's clock: speed must be 1, not 2"),
+        ("sim://?autopilot=crazyflie&speed=0.5", "Crazyflie uses the computer's clock: speed must be 1, not 0.5"),
         ("sim://?autopilot=px4&native=attitude", "native is an option of the built-in autopilot, but px4 flies"),
         ("sim://?autopilot_folder=/tmp", "give autopilot=… as well"),
         ("sim://?autopilot=ardupilot&takeof_altitude=2", "no option of mavlink:// named 'takeof_altitude'"),

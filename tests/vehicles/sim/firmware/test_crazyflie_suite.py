@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
 
 import pytest
 
@@ -37,9 +36,8 @@ class TestCrazyflieInTheSimulator(DriverSuite):
     lost_timeout_s = 10.0
 
     @pytest.fixture(autouse=True)
-    def _cache(self, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    def _cache(self, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "crazyflie"))
-        yield
 
     def make(self, uri: VehicleUri) -> Driver:
         self.driver = super().make(uri)
