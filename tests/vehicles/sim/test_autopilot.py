@@ -89,7 +89,7 @@ def test_invalid_addresses_are_refused(uri: str, message: str) -> None:
 
 
 def test_the_vehicle_suits_the_firmware() -> None:
-    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER)):
+    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER), ("crazyflie", CRAZYFLIE)):
         options = options_of(parse_uri(f"sim://?autopilot={autopilot}"))
         assert options.parameters == vehicle
         assert options.autopilot == autopilot

@@ -162,7 +162,7 @@ def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
 def test_it_hovers_without_its_proxy_and_is_landed_by_the_next(
     velocity: bool, proxy: Callable[..., Process], start: Callable[..., Process], tmp_path: Path
 ) -> None:
-    """The vehicle's high-level commander goes on: a dead proxy is no fall, even while velocities are sent."""
+    """Its high-level commander continues: it does not fall when its proxy dies, even while velocities are sent."""
     told = tmp_path / "heights"
     world = start(WORLD, str(told))
     world.until("flies", PATIENCE_S)

@@ -203,7 +203,7 @@ class Crazyflie(CoupledFirmware):
             before[0].close()
 
     def _begin(self) -> None:
-        self._step = self._unread = 0  # the client stays: it is told nothing, as by a vehicle that restarts
+        self._step = self._unread = 0  # the client stays, and notices a vehicle that restarts
 
     def _receive(self, wait_s: float) -> Commands | None:  # noqa: ARG002  no reply is owed: it runs in real time
         commands: Commands | None = None
