@@ -75,6 +75,7 @@ ALIVE_NS: Final = nanoseconds(0.5)  #: time between packets that keep a connecti
 DEGRADED_NS: Final = nanoseconds(0.5)
 LOST_NS: Final = nanoseconds(1.5)
 FIRST_DATA_NS: Final = nanoseconds(2.0)
+CLOCK_WINDOW_S: Final = 1.0  #: window of the estimate of the vehicle's clock, which is slow in a starved simulation
 STAMPS: Final = 1 << 24  #: log time stamps [ms] begin again there
 MAX_CONSOLE: Final = 400  #: longest line kept from the console [characters]
 POWER_OFF, POWER_ON = b"\xfe\x02", b"\xfe\x03"  #: in a null packet: switch the vehicle's main processor
@@ -163,7 +164,7 @@ class CrazyflieSession(VehicleSession):
         self._main = 0  # the block whose data completes a state
         self._urgent: deque[bytes] = deque()  # packets to be sent at the next poll, without an answer
         self._watch = RestartWatch(wrap=STAMPS)
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps, self._stamp = 0, 0
         self._called_ns = now_ns - HELLO_NS
         self._alive_ns = now_ns
@@ -525,7 +526,7 @@ class CrazyflieSession(VehicleSession):
         self._abandon()
         self._blocks.clear()
         self._watch.forget()
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps = self._stamp = 0
         self.setpoints.lost(now_ns)
         self.telemetry.forget()
