@@ -252,10 +252,13 @@ class Crazyflie(CoupledFirmware):
             self._tell(packet)
 
     def _tell(self, packet: bytes) -> None:
+        self._unread += 1
+        self._sent_s = time.monotonic()
+        self._send_to_firmware(packet)
+
+    def _send_to_firmware(self, packet: bytes) -> None:
         link = self._link
         if link is not None:
-            self._unread += 1
-            self._sent_s = time.monotonic()
             with suppress(OSError):  # the firmware has just ended
                 link[0].sendto(packet, link[1])
 
