@@ -18,6 +18,7 @@ from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.vehicles.sim.firmware import crazyflie
 from skyloop.vehicles.sim.firmware.crazyflie import (
     EMPTY,
+    SWITCH_OFF,
     VARIABLE,
     Crazyflie,
     decode_motors,
@@ -154,6 +155,13 @@ def test_its_death_stops_the_rotors_and_its_client_goes_on_with_the_next(rig: Ri
     rig.event(FirmwareEventKind.ANSWERS)
     client.send(b"\xe0two")
     assert answer(rig, client) == b"\xe0two"
+
+
+def test_its_client_can_switch_it_off_and_it_starts_again(rig: Rig, client: socket.socket) -> None:
+    rig.answered()
+    client.send(SWITCH_OFF)
+    rig.event(FirmwareEventKind.DIED)
+    rig.event(FirmwareEventKind.ANSWERS)
 
 
 def test_a_deaf_start_is_ended_and_another_one_begins_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,8 @@ from the firmware
 =========================  =============================================================================================
 
 All other packets are those of the user's client: they are exchanged between the firmware and the client that last sent
-to :attr:`Crazyflie.address`. A lone ff, the packet without content, is answered here, as a radio acknowledges it.
+to :attr:`Crazyflie.address`. A vehicle's radio handles two packets itself, as does this coupling: the lone ff, which is
+acknowledged, and ff fe 02, which switches the firmware off. It is then started again.
 
 This build of the firmware has no decks: it can't be given a flow sensor's or a range finder's readings. Its position is
 the true one, unless ``position=none``.
@@ -71,6 +72,7 @@ _PAUSE_S: Final = 0.05  # time between requests
 MAX_PACKET: Final = 32  #: bytes
 HELLO: Final = b"\xf3"
 EMPTY: Final = b"\xff"
+SWITCH_OFF: Final = b"\xff\xfe\x02"  #: a packet for a vehicle's radio, which switches the rest of the vehicle off
 VERSION: Final = b"\xd1\x00"  #: request for the protocol's version, from port 13
 SIMULATOR: Final = 0x90  #: header of port 9, channel 0
 
@@ -248,6 +250,8 @@ class Crazyflie(CoupledFirmware):
             return  # there is none
         if packet == EMPTY:
             self._answer(EMPTY)
+        elif packet == SWITCH_OFF:
+            self.program.restart()
         elif packet and packet[0] >> 4 != SIMULATOR >> 4:
             self._tell(packet)
 

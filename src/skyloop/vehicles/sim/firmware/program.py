@@ -115,6 +115,12 @@ class Program:
         self._thread = threading.Thread(target=self._run, name="skyloop-firmware", daemon=True)
         self._thread.start()
 
+    def restart(self) -> None:
+        """Have the process end, after which it is started again. Does not wait."""
+        with self._lock:
+            if self._child is not None:
+                self._child.part()
+
     def close(self) -> None:
         """End the process. Idempotent."""
         with self._lock:
