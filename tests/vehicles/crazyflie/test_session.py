@@ -196,6 +196,13 @@ def test_an_emergency_stop_is_sent_until_it_is_seen(tmp_path: Path) -> None:
     rig.until(lambda: rig.state is FlightState.LANDED, 3.0)
 
 
+def test_a_stop_for_a_vehicle_of_unknown_version_is_sent_in_all_layouts(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.mute = True
+    rig.apply(EmergencyStop())
+    assert rig.stops == {CrtpPort.LOCALISATION, CrtpPort.SUPERVISOR}
+
+
 # Flying --------------------------------------------------------------------------------------------------------------
 
 

@@ -36,6 +36,7 @@ from skyloop.vehicles.crazyflie.telemetry import (
 )
 from skyloop.vehicles.crazyflie.wire import contents
 from skyloop.vehicles.crazyflie.wire.commander import (
+    EmergencyStopMessage,
     ExternalPoseMessage,
     Message,
     Recover,
@@ -146,6 +147,7 @@ class CrazyflieSession(VehicleSession):
         self.setpoints = CrazyflieSetpoints(self.telemetry, options.velocity, dict(options.limits))
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "unanswered"), 0))
         self.protocol = NEWEST_PROTOCOL
+        self._knows_protocol = False
         self.firmware = ""
         self.device = ""
         self.values: dict[int, float] = {}  #: the parameters' values that are known, by number
@@ -331,7 +333,7 @@ class CrazyflieSession(VehicleSession):
         if self._abandoned:
             return
         if query is VersionQuery.PROTOCOL:
-            self.protocol = number if answer is not None else 0
+            self.protocol, self._knows_protocol = number if answer is not None else 0, True
             if not OLDEST_PROTOCOL <= self.protocol <= NEWEST_PROTOCOL:
                 text = (
                     f"the vehicle speaks version {self.protocol} of its protocol; "
@@ -458,7 +460,11 @@ class CrazyflieSession(VehicleSession):
         self.due_ns = now_ns + TICK_NS
         packets = list(self._urgent)
         self._urgent.clear()
-        packets += [self._framed(each.encode(self.protocol)) for each in self._messages(now_ns)]
+        for each in self._messages(now_ns):
+            # Before the version is known, a stop is sent in all layouts.
+            unknown = isinstance(each, EmergencyStopMessage) and not self._knows_protocol
+            versions = [self.protocol] if not unknown else [OLDEST_PROTOCOL, NEWEST_PROTOCOL]
+            packets += [self._framed(each.encode(version)) for version in versions]
         packets += self._power(now_ns)
         if self._stage is Stage.CALLING:
             if now_ns - self._called_ns >= HELLO_NS:
