@@ -217,6 +217,8 @@ def test_an_emergency_stop_is_sent_until_it_is_seen(tmp_path: Path) -> None:
     assert len(rig.sent) == sent
     with pytest.raises(DriverError, match="reset"):
         rig.apply(Takeoff())
+    with pytest.raises(DriverError, match="switch it off"):
+        rig.apply(ResetEmergency())
     rig.restart()  # by hand, as a locked vehicle needs
     rig.run(4.0)
     assert rig.state is FlightState.EMERGENCY
