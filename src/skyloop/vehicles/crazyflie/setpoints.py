@@ -109,7 +109,8 @@ class CrazyflieSetpoints:
         self.limits = limits
         self.receiving = False  #: whether the vehicle's state is arriving
         self.stop = MotorStop(self._leave_alone)
-        self.reset_wanted = False  #: whether the vehicle must be restarted to end a stop
+        self.restartable = False  #: whether the link can restart the vehicle
+        self.reset_wanted = False  #: whether the vehicle must be restarted, or recover from a crash, to end a stop
         self.left_alone = False  #: after an abandoned stop or landing, until a new action
         self._mode = velocity
         self._decision = Decision.STAY
@@ -131,6 +132,7 @@ class CrazyflieSetpoints:
         self._heading_rad: float | None = None  # heading to keep on flights to places
         self._rises_until_ns = 0
         self._lands_until_ns = 0
+        self._landed = False  # whether a landing has ended with the motors off
         self._armed_ns: int | None = None  # when we last asked to arm
         self._disarm = False
         self._events: list[VehicleEvent] = []
@@ -153,7 +155,7 @@ class CrazyflieSetpoints:
     def flight_state(self, now_ns: int) -> FlightState:
         if self.stop.shown:
             return FlightState.EMERGENCY
-        flying = self.telemetry.is_flying(now_ns)
+        flying = self._flies(now_ns)
         if self._decision is Decision.LAND and (flying or now_ns < self._rises_until_ns):
             return FlightState.LANDING
         if not flying:
@@ -162,6 +164,15 @@ class CrazyflieSetpoints:
             return FlightState.TAKING_OFF
         still = self._setpoint is None or self._setpoint == Velocity() or self._arrived()
         return FlightState.HOVERING if still and self.telemetry.estimate.speed_m_s < SLOW_M_S else FlightState.FLYING
+
+    def _flies(self, now_ns: int) -> bool | None:
+        """Return whether the vehicle flies; None if unknown.
+
+        Firmware counts a vehicle as flying for seconds after a landing, when its motors are already off.
+        """
+        if self._landed and self.telemetry.motors_run is False:
+            return False
+        return self.telemetry.is_flying(now_ns)
 
     def _arrived(self) -> bool:
         position = self.telemetry.estimate.position_m
@@ -233,7 +244,7 @@ class CrazyflieSetpoints:
     def _take_off(self, now_ns: int) -> None:
         if not self.receiving or self._state_ns is None or now_ns - self._state_ns > FRESH_NS:
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
-        if self.telemetry.is_flying(now_ns):
+        if self._flies(now_ns):
             if self._decision is not Decision.TAKE_OFF:
                 self._remain(None, now_ns)
             return
@@ -243,7 +254,7 @@ class CrazyflieSetpoints:
         self._decide(Decision.TAKE_OFF, now_ns)
 
     def _remain(self, setpoint: Velocity | Attitude | Position | None, now_ns: int) -> None:
-        flying = bool(self.telemetry.is_flying(now_ns))
+        flying = bool(self._flies(now_ns))
         if self._decision is not Decision.STAY and not flying:
             return  # a take-off ends in a hover; one that a landing withdrew could still happen
         anew = self._decision is not Decision.STAY or not self._steering
@@ -310,6 +321,8 @@ class CrazyflieSetpoints:
     def _reset(self) -> None:
         if self.stop.active and not self.receiving:
             raise DriverError("no data from the vehicle: cannot tell whether it is on the ground")
+        if self.telemetry.is_locked and not self.restartable:
+            raise DriverError("the vehicle is locked: switch it off and on again, then reset the emergency")
         self.stop.reset()
         self._steering = False
         self.reset_wanted = bool(self.telemetry.is_locked or self.telemetry.is_set(Supervisor.IS_CRASHED))
@@ -330,7 +343,9 @@ class CrazyflieSetpoints:
     def on_state(self, now_ns: int) -> None:
         """Handle a new state of the telemetry."""
         self.receiving, self._state_ns = True, now_ns
-        flying = bool(self.telemetry.is_flying(now_ns))
+        landing = self._decision is Decision.LAND and now_ns >= self._rises_until_ns
+        self._landed = self.telemetry.motors_run is False and (self._landed or landing)
+        flying = bool(self._flies(now_ns))
         rose, self._was_flying = self._was_flying, flying
         estimate = self.telemetry.estimate
         if self._decision is Decision.TAKE_OFF:
@@ -400,11 +415,11 @@ class CrazyflieSetpoints:
         return [*self._flown(now_ns), *steered]
 
     def _may_fly(self, now_ns: int) -> bool:
-        flying = self.telemetry.is_flying(now_ns)
+        flying = self._flies(now_ns)
         return now_ns < self._rises_until_ns or (self._was_flying if flying is None else flying)
 
     def _starting(self, now_ns: int) -> list[Message]:
-        landed = self.telemetry.is_flying(now_ns) is False
+        landed = self._flies(now_ns) is False
         if not landed:
             self._flight = None
             return []
@@ -531,7 +546,7 @@ class CrazyflieSetpoints:
         if not self.stop.settled(self._state_ns):
             return None
         running = self.telemetry.motors_run
-        return not self.telemetry.is_flying(now_ns) if running is None else not running
+        return not self._flies(now_ns) if running is None else not running
 
 
 def _eased(now: Velocity, wanted: Velocity, since_s: float) -> Velocity:
