@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 
 import pytest
@@ -14,6 +15,7 @@ from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite, Flight
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import EmergencyStop, FlightState, Hover, LinkState, ResetEmergency
+from skyloop.vehicles.sim.driver import SimDriver
 from skyloop.vehicles.sim.firmware.crazyflie import VARIABLE
 
 
@@ -48,7 +50,7 @@ class TestCrazyflieInTheSimulator(DriverSuite):
         self.driver.set_parameter("sim.link", True)
 
     def test_emergency_stop_and_reset(self) -> None:
-        """As in the suite, but the reset restarts a locked Crazyflie, and its link is lost meanwhile."""
+        """As in the suite, but a locked Crazyflie has to be switched off and on before the reset."""
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
             driver.apply(EmergencyStop())
@@ -56,7 +58,11 @@ class TestCrazyflieInTheSimulator(DriverSuite):
             driver.apply(Hover())
             time.sleep(0.2)
             flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
-            driver.apply(ResetEmergency())
+            assert isinstance(driver, SimDriver)
+            assert driver.firmware is not None
+            assert driver.firmware.firmware is not None
+            os.kill(driver.firmware.firmware.program.pid, signal.SIGKILL)
             assert sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
             assert sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
+            driver.apply(ResetEmergency())
             flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
