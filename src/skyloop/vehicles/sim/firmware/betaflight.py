@@ -192,16 +192,16 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        self._pace.open()
         try:
             self._instance = reserve_instance(self.NAME, 1, _ports)
         except UsageError:
             if not ports.is_possible():
                 raise
             self._network = SeparateNetwork(MOTORS_PORT, MSP_PORT)
-            return
-        self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
-        self._motors.setblocking(False)
+        else:
+            self._motors = bound(socket.SOCK_DGRAM, MOTORS_PORT)
+            self._motors.setblocking(False)
+        self._pace.open()
 
     def _close(self) -> None:
         self._pace.close()
