@@ -1,0 +1,1 @@
+"""Bitcraze's Crazyflie and its relatives: their protocol CRTP, the driver, and emulated firmware."""
