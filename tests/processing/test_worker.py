@@ -18,6 +18,7 @@ from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
 from tests.support.fake_vehicle import WAIT_S, Node, node
 from tests.support.scripted_proxy import QUICK
+from tests.support.systems import STEP_NS, only_on
 
 __all__ = ["node"]  # a fixture
 
@@ -81,7 +82,7 @@ def test_results_carry_the_capture_of_their_frame(node: Node, eye: Drone) -> Non
     for result in got:
         assert result.value["captured_ns"] == result.captured_ns
         assert result.value["corner"].shape == (1, 1, 3)
-        assert result.made_ns > result.captured_ns
+        assert result.made_ns + STEP_NS > result.captured_ns
     assert (
         len({(result.value["value"] - result.seq) % 256 for result in got}) == 1
     )  # the vehicle draws its count of frames
@@ -198,6 +199,7 @@ def test_shapes_are_drawn_and_none_publishes_no_result(node: Node, eye: Drone) -
     assert drawn[0].shapes == (box,)
 
 
+@only_on("linux", "darwin", reason="frames that are younger than a step of the clock are 0 s old")
 def test_old_frames_are_skipped_and_counted(node: Node, eye: Drone) -> None:
     with working(node, lambda frame: frame.seq, max_age_s=0.0) as worker:
         eye.wait(lambda _: worker.status.stale >= 5, WAIT_S)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import (
@@ -88,7 +88,7 @@ class FakeVehicle(Driver):
             if self.mute.is_set():
                 continue
             number += 1
-            now_ns = time.monotonic_ns()
+            now_ns = monotonic_ns()
             yaw_rad, position_m = number * 0.01, self.position_m
             sink.feedback(
                 Feedback(captured_ns=now_ns, state=self.state, yaw_rad=yaw_rad, altitude_m=1.0, position_m=position_m)

@@ -11,6 +11,9 @@ import pytest
 #: What Skyloop takes for its system.
 PLATFORM = os.environ.get("SKYLOOP_PRETEND") or sys.platform
 
+#: Step of the clock there, if it is long: a time may be that much older than it is, and two may be equal.
+STEP_NS = 15_625_000 if PLATFORM == "win32" else 0
+
 
 def only_on(*systems: str, reason: str) -> pytest.MarkDecorator:
     """Skip a test on all other systems. ``reason``: what they lack, or what the test reads there."""

@@ -12,6 +12,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.systems import PLATFORM
+
+if PLATFORM != "linux":
+    pytest.skip("not there: the fast side of the local transport, and locks of POSIX", allow_module_level=True)
+
 from skyloop.errors import LinkError
 from skyloop.messages import EventKind, Hello, Refusal, Refused, Role, Welcome
 from skyloop.proxy.requests import HELLO_NS

@@ -77,7 +77,7 @@ class _StandIn(types.ModuleType):
 
     def __init__(self, real: types.ModuleType, missing: Sequence[str], **replaced: Any) -> None:
         super().__init__(real.__name__)
-        self.__dict__.update(_real=real, _missing=frozenset(missing), **replaced)
+        self.__dict__.update(_real=real, _missing=frozenset(missing), _before={}, **replaced)
 
     def __getattr__(self, name: str) -> Any:
         if name in self._missing:
@@ -88,7 +88,11 @@ class _StandIn(types.ModuleType):
         if name in self.__dict__:  # differs from the real module's
             self.__dict__[name] = value
         else:
+            self._before.setdefault(name, getattr(self._real, name, None))
             setattr(self._real, name, value)
+
+    def __delattr__(self, name: str) -> None:  # tests put back what they replaced
+        setattr(self._real, name, self._before.pop(name))
 
     def __dir__(self) -> list[str]:
         return [name for name in dir(self._real) if name not in self._missing]

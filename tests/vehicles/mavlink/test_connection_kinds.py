@@ -19,6 +19,7 @@ from skyloop.transport.testing import wait_until
 from skyloop.vehicles.mavlink.link import MavlinkConnection, SerialPort, open_connection
 from skyloop.vehicles.mavlink.options import Address, ConnectionKind, options_of
 from skyloop.vehicles.mavlink.protocol import Packet
+from tests.support.systems import only_on
 
 LOCAL = "127.0.0.1"
 
@@ -140,6 +141,7 @@ def test_tcp_carries_bytes_and_reports_its_end() -> None:
             ours.receive()
 
 
+@only_on("linux", "darwin", reason="a small buffer to send from always drains into that of the other end")
 def test_tcp_sends_half_a_frame_to_its_end_and_then_whole_ones() -> None:
     """The rest of half a frame would be noise to the vehicle; a whole frame without room is merely lost."""
     frame = bytes(32 << 20)

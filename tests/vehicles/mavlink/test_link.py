@@ -36,6 +36,7 @@ from skyloop.vehicles.mavlink.wire.codec import dialect as m
 from tests.support.systems import only_on
 from tests.vehicles.mavlink.scripted import ARDUPILOT, Vehicle, options
 
+shares_threads = only_on("linux", "darwin", reason="each link has a thread of its own")
 PATIENCE_S = 15.0
 
 
@@ -77,6 +78,7 @@ def test_udp_that_sends_first() -> None:
         up(sink)
 
 
+@shares_threads
 def test_a_shared_thread_serves_it_too() -> None:
     thread = LinkThread()
     with firmware() as it:
@@ -95,6 +97,7 @@ def test_a_shared_thread_serves_it_too() -> None:
     assert not sink.problems
 
 
+@shares_threads
 def test_an_unresolvable_name_delays_no_other_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """The shared thread returns for the answer once there is one."""
     released, found = threading.Event(), socket.getaddrinfo("127.0.0.1", None, type=socket.SOCK_STREAM)

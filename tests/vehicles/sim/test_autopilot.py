@@ -28,7 +28,10 @@ from skyloop.vehicles.sim.firmware.ardupilot import VARIABLE
 from skyloop.vehicles.sim.firmware_flight import FirmwareFlight, _InnerSink
 from skyloop.vehicles.sim.options import options_of
 from skyloop.vehicles.sim.telemetry import truth_at
+from tests.support.systems import only_on
 from tests.vehicles.sim.firmware.rig import program
+
+pytestmark = only_on("linux", "darwin", reason="no firmware runs there")
 
 LONG_S = 60.0
 POSE = ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)

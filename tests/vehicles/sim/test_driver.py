@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,6 +86,13 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
 def test_bad_options_are_refused(uri: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         make_driver(uri)
+
+
+@pytest.mark.parametrize("firmware", ["ardupilot", "betaflight", "px4"])
+def test_windows_runs_no_firmware(firmware: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skyloop.vehicles.sim.options.sys", SimpleNamespace(platform="win32"))
+    with pytest.raises(UsageError, match=f"{firmware} does not run on Windows: remove autopilot="):
+        make_driver(f"sim://?autopilot={firmware}")
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from skyloop.messages import FlightState, LinkState, Refusal, Takeoff
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.tello.emulator import TelloFirmware, with_tellos
+from tests.support.systems import only_on
 from tests.support.tello_addresses import Addresses
 
 pytest.importorskip("av")
@@ -100,6 +101,7 @@ def test_a_missing_interface_is_reported() -> None:
         assert "nosuch0" in sink.links[-1][1]
 
 
+@only_on("linux", reason="sockets are bound to no interface there")
 def test_the_loopback_interface_can_be_named() -> None:
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

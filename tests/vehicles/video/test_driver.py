@@ -26,6 +26,7 @@ from skyloop.pyav import new_decoder
 from skyloop.vehicles.ardrone.wire.pave import PaveParser
 from skyloop.vehicles.video.v4l2 import cameras, described
 from tests.support.recordings import recorded
+from tests.support.systems import STEP_NS, only_on
 
 LONG, TORN = "ardrone2/video-8s.pave", "ardrone2/video-64-byte-headers.pave"
 FAST = "speed=1000"
@@ -160,7 +161,7 @@ def test_images_arrive_at_the_times_of_their_stamps() -> None:
     assert took_s > 0.4
     late = np.array([frame.arrived_ns - frame.captured_ns for frame in sink.frames]) / 1e9
     assert (late >= 0).all()
-    assert np.median(late) < 0.02
+    assert np.median(late) < 0.02 + STEP_NS / 1e9
 
 
 def test_a_clip_plays_in_order_with_its_intrinsics(clip: Path) -> None:
@@ -406,6 +407,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield Path(folder) / "video0"
 
 
+@only_on("linux", reason="cameras have no nodes there")
 def test_a_device_that_disappears_is_reopened_with_exposure_and_gain(device: Path) -> None:
     sink = RecordingSink()
     asked = f"video://{device}?width=64&height=48&fps=25&exposure=8&gain=auto"

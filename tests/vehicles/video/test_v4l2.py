@@ -14,6 +14,7 @@ from skyloop.errors import UsageError
 from skyloop.vehicles.video import v4l2
 from skyloop.vehicles.video.driver import DeviceOptions
 from skyloop.vehicles.video.v4l2 import CameraDevice, FrameSize, PixelFormat, V4l2Device, listed
+from tests.support.systems import only_on
 
 MJPG, YUYV, BGR = (int.from_bytes(code, "little") for code in (b"MJPG", b"YUYV", b"BGR3"))
 
@@ -160,6 +161,7 @@ def test_a_disabled_setting_is_none(webcam: Webcam) -> None:
     assert V4l2Device(7, webcam).control(v4l2.GAIN) is None
 
 
+@only_on("linux", reason="cameras have no nodes there")
 def test_a_file_that_is_not_a_camera_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "video0"
     path.touch()
@@ -170,6 +172,7 @@ def test_a_file_that_is_not_a_camera_is_reported(tmp_path: Path) -> None:
     assert DeviceOptions().configure(str(path)) == []
 
 
+@only_on("linux", reason="cameras have no nodes there")
 def test_a_listing_has_the_address_the_formats_and_the_settings(webcam: Webcam, tmp_path: Path) -> None:
     path = tmp_path / "video0"
     path.touch()
@@ -180,6 +183,7 @@ def test_a_listing_has_the_address_the_formats_and_the_settings(webcam: Webcam, 
     assert len(lines) == 7
 
 
+@only_on("linux", reason="cameras have no nodes there")
 def test_a_listing_of_an_unreadable_camera_says_why(webcam: Webcam, tmp_path: Path) -> None:
     assert listed(CameraDevice(tmp_path / "gone", "Webcam", True))[1] == "  can't be opened: No such file or directory"
     (tmp_path / "video0").touch()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Final
 from urllib.parse import urlencode
@@ -91,6 +92,8 @@ def _autopilot(uri: VehicleUri) -> AutopilotKind | None:
     known = [kind.value for kind in AutopilotKind]
     if given not in known:
         raise UnknownNameError("autopilot of sim://", given, known)
+    if sys.platform == "win32":
+        raise UsageError(f"{uri}: {given} does not run on Windows: remove autopilot=")
     for name in ("native", "velocity"):
         if name in uri.options:
             raise UsageError(f"{uri}: {name} is an option of the built-in autopilot, but {given} flies: remove it")

@@ -13,6 +13,9 @@ import pytest
 
 from skyloop.vehicles.sim.firmware.betaflight import Betaflight
 from skyloop.vehicles.sim.firmware.keeper import NICENESS, SLACK_NS, request_real_time
+from tests.support.systems import only_on
+
+pytestmark = only_on("linux", "darwin", reason="no firmware runs there")
 
 
 @pytest.fixture

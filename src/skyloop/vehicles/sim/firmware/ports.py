@@ -11,7 +11,6 @@ itself relays the bytes of the firmware's TCP port, to and from an inherited lis
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import socket
 import struct
@@ -194,6 +193,8 @@ def leave_network() -> None:
     """
     if sys.platform != "linux":
         raise OSError("separate networks exist only on Linux")
+    import fcntl
+
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.unshare(_CLONE_NEWNET) and libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET):
         error = ctypes.get_errno()

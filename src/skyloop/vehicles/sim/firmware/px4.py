@@ -7,7 +7,6 @@ https://docs.px4.io/main/en/simulation/#px4-mavlink-api
 
 from __future__ import annotations
 
-import fcntl
 import math
 import os
 import socket
@@ -303,6 +302,8 @@ def _runs(instance: int) -> bool:
     """Return whether a PX4 process holds this instance's lock, in which case another process would exit at once."""
     if sys.platform != "linux":
         return False
+    import fcntl
+
     asked = struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, 0, 0, 0)  # struct flock for the whole file
     try:
         with Path(f"{LOCK_FILE}-{instance}").open("rb") as file:
