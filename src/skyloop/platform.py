@@ -225,13 +225,13 @@ def sees_peers() -> bool:
 
 
 def claim_port(listener: socket.socket) -> None:
-    """Let a TCP socket bind a port that was closed just now, but never one on which another program listens.
-
-    Windows' SO_REUSEADDR would let both listen, and a stranger receive what is meant for the other:
-    learn.microsoft.com/windows/win32/winsock/using-so-reuseaddr-and-so-exclusiveaddruse
-    """
-    option = socket.SO_EXCLUSIVEADDRUSE if sys.platform == "win32" else socket.SO_REUSEADDR
-    listener.setsockopt(socket.SOL_SOCKET, option, 1)
+    """Let a TCP socket bind a port that was closed just now, but never one on which another program listens."""
+    # Windows' SO_REUSEADDR would let both listen, and a stranger receive what is meant for the other:
+    # learn.microsoft.com/windows/win32/winsock/using-so-reuseaddr-and-so-exclusiveaddruse
+    if sys.platform == "win32":
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
+    else:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
 
 
 # Files ----------------------------------------------------------------------------------------------------------
