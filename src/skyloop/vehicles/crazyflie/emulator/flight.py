@@ -315,7 +315,9 @@ class CrazyflieFlight:
 
     def _follow_setpoint(self) -> None:
         message, age_s = self._setpoint, self._time_s - self._setpoint_s
-        if message is None or isinstance(message, wire.StopSetpoint):
+        if age_s > LEVEL_S and self._flight.standing:
+            self._forget()  # on the ground, the high-level commander may fly again
+        if message is None or _stops(message):
             self._off()
         elif age_s > CUT_S and self._flight.airborne:
             self.lock()
@@ -394,6 +396,14 @@ class CrazyflieFlight:
         vz = wanted.velocity[2] + self._climb(wanted.place[2])
         rate = wanted.velocity[3] + _YAW_GAIN_PER_S * wrap_angle(wanted.place[3] - yaw)
         self._flight.move(*turned(vx, vy, self.frame.yaw_rad), vz, clamped(rate, LIMITS.yaw_rate_rad_s))
+
+
+def _stops(message: wire.Message) -> bool:
+    """Return whether a set-point turns the motors off."""
+    least = 1000  # thrust below which the motors are off
+    return isinstance(message, wire.StopSetpoint) or (
+        isinstance(message, wire.RollPitchThrust) and message.thrust < least
+    )
 
 
 def yaw_of(quaternion: tuple[float, float, float, float]) -> float:
