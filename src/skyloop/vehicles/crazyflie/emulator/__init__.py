@@ -219,8 +219,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     @property
     def address(self) -> str:
         """Address for a driver on this machine."""
-        dialect = "?dialect=esp" if self.settings.checksum else ""
-        return f"crazyflie://udp:{self.settings.bind}:{self.port}{dialect}"
+        return f"crazyflie://{'esp' if self.settings.checksum else 'udp'}:{self.settings.bind}:{self.port}"
 
     @property
     def description(self) -> str:
