@@ -21,11 +21,11 @@ from skyloop.vehicles.crazyflie.wire.commander import HighLevelTakeoff, Message
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 
-TICK_S: Final = 0.01
+TICK_S: Final = 0.008
 
 
 class Bench:
-    """A vehicle whose time passes in ticks of 10 ms. ``sent`` lists what the firmware sent by itself."""
+    """A vehicle whose time passes in ticks of 8 ms. ``sent`` lists what the firmware sent by itself."""
 
     def __init__(self, *, protocol: int = 12) -> None:
         world = replace(load_world("empty", 0), targets=())
