@@ -27,10 +27,10 @@ TICK_S: Final = 0.008
 class Bench:
     """A vehicle whose time passes in ticks of 8 ms. ``sent`` lists what the firmware sent by itself."""
 
-    def __init__(self, *, protocol: int = 12) -> None:
+    def __init__(self, *, protocol: int = 12, auto_arm: bool = True) -> None:
         world = replace(load_world("empty", 0), targets=())
         self.simulation = Simulation(world, seed=1, parameters=with_ideal_sensors(CRAZYFLIE))
-        self.protocol = protocol
+        self.protocol, self.auto_arm = protocol, auto_arm
         self.stored: dict[int, float] = {}
         self.ranges = {"front": 1.5, "up": 99.0}
         self.sent: list[CrtpPacket] = []
@@ -38,7 +38,9 @@ class Bench:
 
     def restart(self) -> None:
         vehicle = SimulatedVehicle(self.simulation, 0)
-        self.logic = CrazyflieLogic(vehicle, 0.575, lambda: self.ranges, self.stored, protocol=self.protocol)
+        self.logic = CrazyflieLogic(
+            vehicle, 0.575, lambda: self.ranges, self.stored, protocol=self.protocol, auto_arm=self.auto_arm
+        )
         self._update()
 
     def _update(self) -> None:

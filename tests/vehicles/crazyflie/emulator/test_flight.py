@@ -63,11 +63,33 @@ def test_low_level_set_points_disable_the_high_level_commander_until_they_are_sa
     bench.send(wire.GoTo(0, False, False, 1.0, 0.0, 1.0, 0.0, 2.0))
     bench.run(1.0, HOVER)
     assert abs(bench.place[0]) < 0.1
-    bench.send(wire.NotifySetpointsStop())
     bench.send(wire.GoTo(0, False, False, 1.0, 0.0, 1.0, 0.0, 2.0))
+    bench.send(wire.NotifySetpointsStop())
     bench.run(4.0)
     assert math.dist(bench.place[:3], (1.0, 0.0, 1.0)) < 0.08
     assert not has(bench, Supervisor.HIGH_LEVEL_DISABLED)
+
+
+def test_when_set_points_are_said_to_stop_and_no_flight_was_asked_for_since_it_falls(bench: Bench) -> None:
+    bench.fly()
+    bench.run(1.0, HOVER)  # ends the take-off's flight
+    bench.send(wire.NotifySetpointsStop(1000))
+    bench.run(0.05)
+    assert not bench.turns
+    bench.run(3.0)
+    assert not has(bench, Supervisor.IS_LOCKED)
+    bench.fly()
+
+
+def test_a_stop_set_point_in_the_air_disables_the_high_level_commander_and_then_locks(bench: Bench) -> None:
+    bench.fly()
+    bench.send(wire.StopSetpoint())
+    bench.run(1.0)
+    assert [answer.data[3] for answer in bench.send(TAKE_OFF)] == [0]
+    bench.run(0.5)
+    assert not bench.turns
+    bench.run(1.0)
+    assert has(bench, Supervisor.IS_LOCKED)
 
 
 def test_on_the_ground_the_high_level_commander_may_fly_again_after_a_while(bench: Bench) -> None:
@@ -123,10 +145,11 @@ def test_the_oldest_set_point_needs_thrust_zero_first(bench: Bench) -> None:
     assert not bench.turns
 
 
-@pytest.mark.parametrize("message", [wire.StopSetpoint(), wire.EmergencyStopMessage(), wire.Arm(False)])
+@pytest.mark.parametrize("message", [wire.StopSetpoint(), wire.EmergencyStopMessage(), wire.Arm(False)], ids=repr)
 @pytest.mark.parametrize("protocol", [7, 12])
 def test_what_stops_the_motors_in_the_air(message: wire.Message, protocol: int) -> None:
-    bench = Bench(protocol=protocol)
+    bench = Bench(protocol=protocol, auto_arm=False)
+    bench.send(wire.Arm(True))
     bench.fly()
     bench.send(message)
     bench.run(0.05)
@@ -146,9 +169,9 @@ def test_an_emergency_stop_lasts_until_a_restart(bench: Bench) -> None:
     bench.fly()
     bench.send(wire.EmergencyStopMessage())
     bench.run(3.0)
-    assert [answer.data[3] for answer in bench.send(TAKE_OFF)] == [8]
+    assert [answer.data[3] for answer in bench.send(TAKE_OFF)] == [0]  # and yet it does not fly
     (answer,) = bench.send(wire.Arm(True))
-    assert answer.data[1:] == b"\0\1"
+    assert answer.data[1:] == b"\0\0"
     bench.run(3.0, HOVER)
     assert not bench.turns
     assert b"Locked" in b"".join(packet.data for packet in bench.sent if packet.port == CrtpPort.CONSOLE)
@@ -166,8 +189,11 @@ def test_the_watchdog_for_emergency_stops_begins_with_its_first_message(bench: B
 
 
 def test_disarmed_it_does_not_start(bench: Bench) -> None:
+    assert bench.logic.flight.supervisor & 0xFF == 0x0E
     bench.send(wire.Arm(False))
-    assert not has(bench, Supervisor.CAN_FLY)
+    assert bench.logic.flight.supervisor & 0xFF == 0x0E  # it arms itself
+    bench = Bench(auto_arm=False)
+    assert bench.logic.flight.supervisor & 0xFF == 0x01
     bench.run(1.0, HOVER)
     assert not bench.turns
     bench.send(wire.Arm(True))
@@ -214,11 +240,11 @@ def test_an_uploaded_trajectory_relative_and_backwards(bench: Bench) -> None:
         assert math.dist(bench.place[:3], (x, 0.0, 1.0)) < 0.1
 
 
-def test_an_undefined_trajectory_is_refused(bench: Bench) -> None:
+def test_an_undefined_trajectory_is_not_flown(bench: Bench) -> None:
     bench.fly()
-    assert [answer.data[3] for answer in bench.send(wire.StartTrajectory(0, True, False, False, 1, 1.0))] == [8]
+    bench.send(wire.StartTrajectory(0, True, False, False, 1, 1.0))
     bench.send(wire.DefineTrajectory(1, 1, 0, 4000, 2))  # reaches beyond the memory
-    assert [answer.data[3] for answer in bench.send(wire.StartTrajectory(0, True, False, False, 1, 1.0))] == [8]
+    bench.send(wire.StartTrajectory(0, True, False, False, 1, 1.0))
     bench.run(1.0)
     assert math.dist(bench.place[:3], (0.0, 0.0, 1.0)) < 0.05
 
@@ -234,6 +260,21 @@ def test_a_spiral(bench: Bench, clockwise: bool, sideways: bool, end: tuple[floa
     x, y, yaw = end
     assert math.dist(bench.place[:3], (x, y, 1.2)) < 0.12
     assert abs(math.remainder(bench.place[3] - (yaw if sideways else math.pi), math.tau)) < 0.15
+
+
+@pytest.mark.parametrize("message", [wire.GoTo(0, False, False, 0.0, 0.0, 1.0, 0.0, 2.0), wire.EmergencyStopMessage()])
+def test_older_firmware_does_not_know_newer_messages(message: wire.Message) -> None:
+    bench = Bench(protocol=7)
+    answers = bench.logic.receive(message.encode(12))
+    assert [answer.data[3] for answer in answers] == [8] * len(answers)
+    bench.run(2.0)
+    assert not bench.turns
+    assert not has(bench, Supervisor.IS_LOCKED)
+
+
+def test_a_second_take_off_is_refused(bench: Bench) -> None:
+    bench.fly()
+    assert [answer.data[3] for answer in bench.send(TAKE_OFF)] == [1]
 
 
 def test_groups(bench: Bench) -> None:

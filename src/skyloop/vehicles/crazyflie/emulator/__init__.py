@@ -31,7 +31,6 @@ from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.vehicles import CRAZYFLIE
 from skyloop.vehicles.crazyflie.emulator.logic import PROTOCOL, CrazyflieLogic
 from skyloop.vehicles.crazyflie.wire.crtp import (
-    HELLO,
     NEWEST_PROTOCOL,
     OLDEST_PROTOCOL,
     CrtpPacket,
@@ -78,6 +77,7 @@ class CrazyflieSettings:
     bind: str
     port: int
     protocol: int
+    auto_arm: bool
     checksum: bool
     faults: Faults
     delay_s: float
@@ -102,6 +102,7 @@ class RunningFirmware(RunningEmulator):
             self._ranges,
             stored,
             protocol=settings.protocol,
+            auto_arm=settings.auto_arm,
         )
         try:
             self._udp = DatagramPort(
@@ -143,8 +144,8 @@ class RunningFirmware(RunningEmulator):
         except DecodeError:
             return
         self._client = sender
-        if datagram == HELLO:
-            self._send(HELLO, sender)
+        if packet.is_null:  # a greeting, or a search for vehicles
+            self._send(datagram, sender)
         for answer in self.logic.receive(packet):
             self._send(answer.encode(), sender)
 
@@ -172,6 +173,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         bind: The local address to listen on.
         port: The UDP port; 0 for any free one.
         protocol: Version of CRTP, 7 to 12.
+        auto_arm: Whether it arms itself, as vehicles with brushed motors do.
         checksum: Whether each packet ends with a checksum, as in ESP-Drone and LiteWing.
         faults: Faults injected into all datagrams in both directions.
         delay_s: Delay added to all datagrams in each direction.
@@ -189,6 +191,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         bind: str = "127.0.0.1",
         port: int = PORT,
         protocol: int = PROTOCOL,
+        auto_arm: bool = True,
         checksum: bool = False,
         faults: Faults = NO_FAULTS,
         delay_s: float = 0.0,
@@ -197,7 +200,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         if not OLDEST_PROTOCOL <= protocol <= NEWEST_PROTOCOL:
             raise UsageError(f"protocol must be from {OLDEST_PROTOCOL} to {NEWEST_PROTOCOL}, got {protocol!r}")
         super().__init__(host, drone)
-        self.settings = CrazyflieSettings(bind, port, protocol, checksum, faults, checked_delay(delay_s))
+        self.settings = CrazyflieSettings(bind, port, protocol, auto_arm, checksum, faults, checked_delay(delay_s))
         self._stored: dict[int, float] = {}
         self._loop = loop
 

@@ -25,12 +25,14 @@ from skyloop.vehicles.emulation.flight import FlightControl, Vehicle
 
 LEVEL_S: Final = 0.5  #: time after the last low-level set-point when the vehicle levels …
 CUT_S: Final = 2.0  #: … and when it cuts its motors, in the air
+FLIES_ON_S: Final = 2.0  #: how long it counts as flying after its motors have stopped
 SINK_M_S: Final = 0.1  #: rate of descent while it levels
 KEEPALIVE_S: Final = 1.0  #: longest time between two resets of the watchdog for emergency stops
 TUMBLED_RAD: Final = math.radians(80)
 LIMITS: Final = Limits(
     tilt_rad=0.5, climb_m_s=2.0, yaw_rate_rad_s=5.0, altitude_m=20.0, speed_m_s=3.0, takeoff_altitude_m=0.3
 )
+_MARGIN_S: Final = 0.05
 _START_M: Final = 0.06  # desired height above the ground at which a standing vehicle starts
 _PLACE_GAIN_PER_S: Final = 1.3
 _SPEED_GAIN_PER_S: Final = 3.0
@@ -41,6 +43,7 @@ _AHEAD_S: Final = 0.2  # how far ahead a path's velocity is taken, because attit
 _HEIGHT_GAIN_PER_S: Final = 1.5
 _YAW_GAIN_PER_S: Final = 2.5
 _TRAJECTORIES: Final = 10  # number of trajectories that can be defined
+_NOT_PERMITTED: Final = 1  # the error's number
 _STILL: Final[Place] = (0.0, 0.0, 0.0, 0.0)
 
 Parameter = Callable[[str], float]
@@ -69,18 +72,19 @@ class Frame:
 class CrazyflieFlight:
     """The part of the firmware that may turn the motors. Not thread-safe."""
 
-    def __init__(self, vehicle: Vehicle, parameter: Parameter, hover_thrust: float) -> None:
+    def __init__(self, vehicle: Vehicle, parameter: Parameter, hover_thrust: float, *, auto_arm: bool = True) -> None:
         self._flight = FlightControl(vehicle)
         vehicle.set_limits(LIMITS)
         self._parameter = parameter
         self._full = 1.0 / hover_thrust  # full thrust as a multiple of the weight
         self.frame = Frame()
-        self.target = Sample(_STILL, _STILL)  #: what it flies to, in the frame
+        self.target = Sample(_STILL, _STILL)  #: the desired place and velocity, in the frame
         self.external_m: Vec3 = (0.0, 0.0, 0.0)  #: newest position from outside
         self.memory = bytearray(4096)  #: uploaded trajectories
         self._trajectories: dict[int, wire.DefineTrajectory] = {}
         self._groups = 0
-        self._armed = True
+        self._auto_arm = auto_arm
+        self._armed = auto_arm
         self._locked = False
         self._crashed = False
         self._keepalive_s: float | None = None  # newest reset of the watchdog; None until the first
@@ -94,6 +98,7 @@ class CrazyflieFlight:
         self._ground_m = 0.0
         self._begun = False
         self._time_s = self._step_s = 0.0
+        self._ran_s = -math.inf  # when the motors last ran
         self._drift = (0.0, 0.0)  # acceleration against a steady wind, in the frame [m/s²]
         self._tumbled = False
 
@@ -106,16 +111,17 @@ class CrazyflieFlight:
 
     @property
     def flying(self) -> bool:
-        return self._flight.state.airborne
+        """Whether it counts as flying."""
+        return self._time_s - self._ran_s < FLIES_ON_S
 
     @property
     def supervisor(self) -> int:
         """Bits of :class:`Supervisor`."""
         may = not (self._locked or self._crashed or self._tumbled)
         bits = {
-            Supervisor.CAN_BE_ARMED: may and not self.flying,
-            Supervisor.IS_ARMED: self._armed,
-            Supervisor.IS_AUTO_ARMED: True,
+            Supervisor.CAN_BE_ARMED: may and not self._armed,
+            Supervisor.IS_ARMED: self._armed and not self._locked,
+            Supervisor.IS_AUTO_ARMED: self._auto_arm,
             Supervisor.CAN_FLY: may and self._armed,
             Supervisor.IS_FLYING: self.flying,
             Supervisor.IS_TUMBLED: self._tumbled,
@@ -134,12 +140,15 @@ class CrazyflieFlight:
     # Messages --------------------------------------------------------------------------------------------------------
 
     def arm(self, wanted: bool) -> bool:
-        """Arm or disarm, which stops the motors even in the air; return whether it was done."""
+        """Arm or disarm, which stops the motors even in the air; return whether it was done.
+
+        A vehicle that arms itself stays armed, in the air as well.
+        """
         if wanted and (self._locked or self._crashed or self._tumbled):
             return False
-        if wanted is not self._armed:
+        if wanted is not self._armed and not self._auto_arm:
             self._armed = wanted
-            self._forget()  # what was asked for before must not start the motors
+            self._forget()  # an earlier set-point must not start the motors
         return True
 
     def recover(self) -> bool:
@@ -148,7 +157,7 @@ class CrazyflieFlight:
             return False
         if self._crashed:
             self._crashed = False
-            self._forget()  # what was asked for before must not start the motors
+            self._forget()  # an earlier set-point must not start the motors
         return True
 
     def crash(self) -> None:
@@ -164,7 +173,7 @@ class CrazyflieFlight:
     def reset_estimate(self) -> None:
         """Begin at the place that the parameters give; in the air, the Flow deck still measures the height."""
         x, y, z, yaw = (self._parameter(f"kalman.initial{name}") for name in ("X", "Y", "Z", "Yaw"))
-        self.frame.align(self._flight, (x, y, self.place[2] if self.flying else z, yaw))
+        self.frame.align(self._flight, (x, y, self.place[2] if self._flight.airborne else z, yaw))
 
     def correct(self, position_m: Vec3, yaw_rad: float | None = None) -> None:
         """Take a position from outside, and a yaw if it is known, as the estimate."""
@@ -186,9 +195,9 @@ class CrazyflieFlight:
                 self.correct((x, y, z))
             case wire.ExternalPoseMessage(x, y, z, qx, qy, qz, qw):
                 self.correct((x, y, z), yaw_of((qx, qy, qz, qw)))
-            case wire.NotifySetpointsStop(remain_valid_ms):
-                self._low_level = False
-                self._setpoint_s = self._time_s + remain_valid_ms / 1000
+            case wire.NotifySetpointsStop():
+                self._low_level = False  # without a new flight of the high-level commander, the motors stop
+                self._setpoint = None
             case wire.SetGroupMask(mask):
                 self._groups = mask
             case _ if hasattr(message, "groups") or isinstance(message, wire.DefineTrajectory):
@@ -202,8 +211,7 @@ class CrazyflieFlight:
             self._thrust_locked = self._thrust_locked and message.thrust > 0
             if self._thrust_locked:
                 return
-        if not self._low_level:
-            self._plan = None
+        self._plan = None
         self._low_level = True
         self._setpoint, self._setpoint_s = message, self._time_s
 
@@ -219,17 +227,16 @@ class CrazyflieFlight:
         if isinstance(message, wire.HighLevelStop):
             self._plan = None
             if not self._low_level:
-                self._setpoint = wire.StopSetpoint()
+                self._setpoint = None
             return CrtpError.NONE
-        if self._locked or self._crashed:
-            return CrtpError.NOT_EXECUTABLE
-        start = self._start()
+        if isinstance(message, wire.HighLevelTakeoff) and self._plan is not None and not self._lands:
+            return _NOT_PERMITTED
         try:
-            plan = self._planned(message, start)
+            plan = self._planned(message, self._start())
         except DecodeError:
             plan = None
-        if plan is None:
-            return CrtpError.NOT_EXECUTABLE
+        if plan is None or self._locked or self._crashed:
+            return CrtpError.NONE  # the firmware does not say that it won't fly
         self._plan, self._plan_s = plan, self._time_s
         self._lands = isinstance(message, wire.HighLevelLand)
         if not self._low_level:
@@ -238,20 +245,18 @@ class CrazyflieFlight:
 
     def _start(self) -> Sample:
         """Return where the next flight of the high-level commander begins: where the present one is, if any."""
-        if self._plan is not None and self.flying and not self._low_level:
+        if self._plan is not None and self._flight.airborne and not self._low_level:
             return self._plan.sample(self._elapsed_s)
         east, north, up = self._flight.velocity
         moving = (*turned(east, north, -self.frame.yaw_rad), up, 0.0)
-        return Sample(self.place, moving if self.flying else _STILL)
+        return Sample(self.place, moving if self._flight.airborne else _STILL)
 
     def _planned(self, message: wire.Message, start: Sample) -> Flight | None:
         x, y, z, yaw = start.place
         match message:
-            case wire.HighLevelTakeoff(_, height, heading, keep, duration_s):
-                if self._plan is not None and not self._lands:
-                    return None
-                return trajectories.move(start, (x, y, height, yaw if keep else heading), duration_s)
-            case wire.HighLevelLand(_, height, heading, keep, duration_s):
+            case wire.HighLevelTakeoff(_, height, heading, keep, duration_s) | wire.HighLevelLand(
+                _, height, heading, keep, duration_s
+            ):
                 return trajectories.move(start, (x, y, height, yaw if keep else heading), duration_s)
             case wire.GoTo():
                 end = (message.x_m, message.y_m, message.z_m, message.yaw_rad)
@@ -310,13 +315,15 @@ class CrazyflieFlight:
             self._follow_plan(self._plan)
         else:
             self._follow_setpoint()
+        if flight.state.airborne:
+            self._ran_s = self._time_s
 
     def _follow_plan(self, plan: Flight) -> None:
         self.target = plan.sample(self._elapsed_s)
         if self._lands and self._elapsed_s >= plan.duration_s:
             if self._flight.standing or self.place[2] > self._ground_m + 0.3:
                 self._plan = None  # the motors stop at the end of a landing, at any height
-                self._setpoint = wire.StopSetpoint()
+                self._setpoint = None
             else:
                 self._flight.land()
             return
@@ -324,7 +331,9 @@ class CrazyflieFlight:
 
     def _follow_setpoint(self) -> None:
         message, age_s = self._setpoint, self._time_s - self._setpoint_s
-        if age_s > LEVEL_S and self._flight.standing:
+        if message is not None and age_s > CUT_S - _MARGIN_S and self.flying and not self._flight.airborne:
+            self.lock()  # the last set-point stopped the motors in flight
+        elif age_s > LEVEL_S and not self.flying:
             self._forget()  # on the ground, the high-level commander may fly again
         if message is None or _stops(message):
             self._off()

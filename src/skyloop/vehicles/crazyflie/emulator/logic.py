@@ -27,8 +27,7 @@ BOOT_TEXT: Final = "SYS: ----------------------------\nSYS: Crazyflie 2.1 is up 
 MAX_BLOCKS: Final = 16
 MAX_VARIABLES: Final = 128  #: in all log blocks together
 _TRAJECTORY_TYPE, _TESTER_TYPE = 0x12, 0x15
-_MEMORIES: Final = (_TRAJECTORY_TYPE, _TESTER_TYPE)  # type of each memory
-_MEMORY_SIZE: Final = 4096
+_MEMORIES: Final = ((_TRAJECTORY_TYPE, 4096), (_TESTER_TYPE, 20480))  # type and size of each memory
 _MOST_READ: Final = 24  # bytes of a memory in one packet
 _NUMBER, _MEMORY_INFO = 1, 2  # requests on MEMORY's first channel
 _CONSOLE_BYTES: Final = 30
@@ -46,6 +45,15 @@ class Block:
     due_s: float = 0.0
 
 
+#: First protocol version with a request, if not the oldest: port, channel, first byte.
+_SINCE: Final = {
+    (layout.port, layout.channel, layout.number): layout.since
+    for kind in wire.Message.__subclasses__()
+    for layout in kind.LAYOUTS
+    if layout.number is not None and layout.since > crtp.OLDEST_PROTOCOL
+} | {(CrtpPort.HIGH_LEVEL, 0, 11): 8}
+
+
 class CrazyflieLogic:
     """A Crazyflie's firmware. Not thread-safe. ``stored`` has the persistent parameters, which survive a restart.
 
@@ -61,11 +69,12 @@ class CrazyflieLogic:
         stored: dict[int, float],
         *,
         protocol: int = PROTOCOL,
+        auto_arm: bool = True,
         number: int = 0xE7,
     ) -> None:
         self._number = number  # last byte of its radio address, by which broadcast poses are addressed
         self.parameters = [stored.get(row.entry.number, row.default) for row in PARAMETER_ROWS]
-        self.flight = CrazyflieFlight(vehicle, self.parameter, hover_thrust)
+        self.flight = CrazyflieFlight(vehicle, self.parameter, hover_thrust, auto_arm=auto_arm)
         self._stored, self._ranges, self._protocol = stored, ranges, protocol
         self._hover_thrust = hover_thrust
         self._blocks: dict[int, Block] = {}
@@ -87,9 +96,9 @@ class CrazyflieLogic:
             return []
 
     def update(self, report: Report, *, talks: bool = True) -> list[CrtpPacket]:
-        """Handle the vehicle's newest report and fly; return what the firmware sends by itself. Called regularly.
+        """Handle the vehicle's newest report and fly; return unsolicited packets. Called regularly.
 
-        Text for the console is kept until somebody listens, that is, ``talks``.
+        Without a client (``talks`` is False), text for the console is kept.
         """
         self._report = report
         time_s = report.believed.time_s
@@ -139,7 +148,8 @@ class CrazyflieLogic:
                 self.flight.handle(wire.ExternalPoseMessage(x, y, z, qx, qy, qz, qw))
         high_level = packet.port == CrtpPort.HIGH_LEVEL
         try:
-            message = wire.decode_message(packet)
+            since = _SINCE.get((packet.port, packet.channel, packet.data[0])) if packet.data else None
+            message = None if since is not None and self._protocol < since else wire.decode_message(packet)
         except DecodeError:
             if not high_level:
                 raise
@@ -177,8 +187,8 @@ class CrazyflieLogic:
                 yield contents.answer_read(number, value, 0 if known else CrtpError.NO_ENTRY)
             else:
                 error = self._write(number, data)
-                known = error in (CrtpError.NONE, CrtpError.NO_ACCESS)
-                yield contents.write_parameter(number, self._encoded(number) if known else bytes((error,)))
+                if error != CrtpError.NO_ACCESS:  # the firmware does not answer then
+                    yield contents.write_parameter(number, bytes((error,)) if error else self._encoded(number))
 
     def _encoded(self, number: int) -> bytes:
         return PARAMETER_ROWS[number].entry.type.encode(self.parameters[number])
@@ -218,7 +228,7 @@ class CrazyflieLogic:
         extended = bytes((contents.PERSISTENT * row.entry.extended,))
         match command:
             case MiscCommand.GET_EXTENDED_TYPE:
-                return extended
+                return extended if row.entry.extended else bytes((CrtpError.NO_ENTRY,))
             case MiscCommand.GET_EXTENDED_TYPE_2:
                 return b"\0" + extended
             case MiscCommand.GET_DEFAULT:
@@ -341,23 +351,24 @@ class CrazyflieLogic:
             if data[0] == _NUMBER:
                 yield CrtpPacket(packet.port, packet.channel, bytes((_NUMBER, len(_MEMORIES))))
             elif data[0] == _MEMORY_INFO:
-                row = b"" if data[1] >= len(_MEMORIES) else struct.pack("<BIQ", _MEMORIES[data[1]], _MEMORY_SIZE, 0)
+                row = b"" if data[1] >= len(_MEMORIES) else struct.pack("<BIQ", *_MEMORIES[data[1]], 0)
                 yield CrtpPacket(packet.port, packet.channel, data[:2] + row)
             return
         number, address = struct.unpack_from("<BI", data)
         reads = packet.channel == crtp.MEMORY_READ
         length = data[5] if reads else len(data) - 5
-        fits = number < len(_MEMORIES) and address + length <= _MEMORY_SIZE and length <= _MOST_READ + 1
+        type_, size = _MEMORIES[number] if number < len(_MEMORIES) else (0, 0)
+        fits = address + length <= size and length <= _MOST_READ + 1
         status = bytes((CrtpError.NONE if fits else 5,))  # EIO
         content = b""
         if fits and reads:
-            content = self._read(number, address, length)
-        elif fits and _MEMORIES[number] == _TRAJECTORY_TYPE:
+            content = self._read(type_, address, length)
+        elif fits and type_ == _TRAJECTORY_TYPE:
             self.flight.memory[address : address + length] = data[5:]
         yield CrtpPacket(packet.port, packet.channel, data[:5] + status + content)
 
-    def _read(self, number: int, address: int, length: int) -> bytes:
-        if _MEMORIES[number] == _TRAJECTORY_TYPE:
+    def _read(self, type_: int, address: int, length: int) -> bytes:
+        if type_ == _TRAJECTORY_TYPE:
             return bytes(self.flight.memory[address : address + length])
         return bytes(place & 0xFF for place in range(address, address + length))
 
