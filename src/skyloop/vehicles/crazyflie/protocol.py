@@ -66,18 +66,23 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
 )
 
 PATIENCE_NS: Final = nanoseconds(0.25)  #: time allowed for an answer
-TRIES: Final = 6  #: number of times a request is sent
+TRIES: Final = 20  #: number of times a request is sent
+FEW_TRIES: Final = 4  #: the same for a request with a waiting caller, or unknown to old firmware
 WINDOW: Final = 4  #: number of requests under way at once: firmware keeps few packets
 TICK_NS: Final = nanoseconds(0.02)
-HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to be heard
+HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to connect
 ALIVE_NS: Final = nanoseconds(0.5)  #: time between packets that keep a connection over UDP open
 DEGRADED_NS: Final = nanoseconds(0.5)
 LOST_NS: Final = nanoseconds(1.5)
 FIRST_DATA_NS: Final = nanoseconds(2.0)
+CLOCK_WINDOW_S: Final = 1.0  #: window of the estimate of the vehicle's clock, which is slow in a starved simulation
 STAMPS: Final = 1 << 24  #: log time stamps [ms] begin again there
 MAX_CONSOLE: Final = 400  #: longest line kept from the console [characters]
 POWER_OFF, POWER_ON = b"\xfe\x02", b"\xfe\x03"  #: in a null packet: switch the vehicle's main processor
 RESTART_NS: Final = nanoseconds(0.3)  #: how long it stays off
+
+#: Parameter of older firmware that switches the high-level commander on.
+HIGH_LEVEL: Final = "commander.enHighLevel"
 
 #: Called with the answer, or None if there was none.
 Done = Callable[[CrtpPacket | None], None]
@@ -101,7 +106,7 @@ class CrtpRequest:
 class Stage(Enum):
     """Progress of a connection."""
 
-    CALLING = auto()  #: nothing is heard
+    CALLING = auto()  #: no packet has arrived
     ASKING = auto()  #: versions and tables are being read
     LOGGING = auto()  #: log blocks are requested; their data follows
 
@@ -152,13 +157,14 @@ class CrazyflieSession(VehicleSession):
         self._queue: deque[CrtpRequest] = deque()
         self._under_way: list[CrtpRequest] = []
         self._abandoned = False  # whether requests are ended rather than unanswered
+        self._enabled = False  # whether the high-level commander was switched on
         self._first: list[int] = []  # numbers of the parameters to read at once
         self._rest: list[int] = []  # numbers of the others
         self._blocks: dict[int, list[Entry]] = {}
         self._main = 0  # the block whose data completes a state
         self._urgent: deque[bytes] = deque()  # packets to be sent at the next poll, without an answer
         self._watch = RestartWatch(wrap=STAMPS)
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps, self._stamp = 0, 0
         self._called_ns = now_ns - HELLO_NS
         self._alive_ns = now_ns
@@ -183,13 +189,14 @@ class CrazyflieSession(VehicleSession):
             self.due_ns = now_ns
         return applied
 
-    def ask(self, packet: CrtpPacket, prefix: bytes, done: Done, *, first: bool = False) -> None:
-        """Send a packet until it is answered; ``first``: before all other requests."""
-        request = CrtpRequest(packet, prefix, done)
-        if first:
-            self._queue.appendleft(request)
-        else:
-            self._queue.append(request)
+    def ask(self, packet: CrtpPacket, prefix: bytes, done: Done, tries: int = TRIES) -> None:
+        """Send a packet until it is answered."""
+        self._queue.append(CrtpRequest(packet, prefix, done, tries))
+        self.due_ns = 0
+
+    def _ask_first(self, packet: CrtpPacket, prefix: bytes, done: Done) -> None:
+        """Send a packet before all other requests, for as long as the caller waits for its answer."""
+        self._queue.appendleft(CrtpRequest(packet, prefix, done, FEW_TRIES))
         self.due_ns = 0
 
     def send_pose(self, pose: ExternalPose, now_ns: int) -> None:
@@ -204,12 +211,12 @@ class CrazyflieSession(VehicleSession):
         """Write a parameter; raises ``ValueError`` if the value doesn't fit its type."""
         entry = self.parameters.entries[number]
         packet = contents.write_parameter(number, entry.type.encode(value))
-        self.ask(packet, packet.data[:2], partial(self._on_written, done), first=True)
+        self._ask_first(packet, packet.data[:2], partial(self._on_written, done))
 
     def store(self, number: int, done: Done, *, clear: bool) -> None:
         """Keep a parameter's value in the vehicle's memory, or forget the kept one."""
         packet = MiscMessage(MiscCommand.CLEAR if clear else MiscCommand.STORE, number).encode()
-        self.ask(packet, packet.data[:3], done, first=True)
+        self._ask_first(packet, packet.data[:3], done)
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
@@ -313,13 +320,16 @@ class CrazyflieSession(VehicleSession):
         self._unreachable = ""
         self._log, self.parameters = Table(CrtpPort.LOG), Table(CrtpPort.PARAMETERS)
         self.values.clear()
+        self._enabled = False
         self.due_ns = 0
         for query in VersionQuery:
-            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query))
+            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), FEW_TRIES)
 
     def _on_version(self, query: VersionQuery, answer: CrtpPacket | None) -> None:
         if answer is not None:
             _, number, text = decode_version_answer(answer)
+        if self._abandoned:
+            return
         if query is VersionQuery.PROTOCOL:
             self.protocol = number if answer is not None else 0
             if not OLDEST_PROTOCOL <= self.protocol <= NEWEST_PROTOCOL:
@@ -364,7 +374,7 @@ class CrazyflieSession(VehicleSession):
 
     def _on_complete(self, table: Table) -> None:
         if table is self.parameters:
-            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR}
+            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR, HIGH_LEVEL}
             ordered = sorted(table.entries.values(), key=lambda entry: entry.full_name not in wanted)
             self._first = [entry.number for entry in ordered if entry.full_name in wanted]
             self._rest = [entry.number for entry in ordered if entry.full_name not in wanted]
@@ -398,6 +408,9 @@ class CrazyflieSession(VehicleSession):
         value = self.values[number] = entry.type.decode(data[: entry.type.size])
         if entry.full_name in (*DECKS, *RANGE_FINDERS, ESTIMATOR):
             self.telemetry.parameters[entry.full_name] = value
+        elif entry.full_name == HIGH_LEVEL and not value and not self._enabled:
+            self._enabled = True
+            self.write(number, 1, _ignore)
 
     def _on_reset(self, answer: CrtpPacket | None) -> None:
         main, slow = choose_variables(list(self._log.entries.values()))
@@ -513,7 +526,7 @@ class CrazyflieSession(VehicleSession):
         self._abandon()
         self._blocks.clear()
         self._watch.forget()
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps = self._stamp = 0
         self.setpoints.lost(now_ns)
         self.telemetry.forget()
@@ -531,3 +544,7 @@ class CrazyflieSession(VehicleSession):
                 "switch the vehicle on; check channel, rate and address, and that no other program uses the Crazyradio"
             )
         return "switch the vehicle on and join its Wi-Fi network; or correct the host in the address"
+
+
+def _ignore(_: CrtpPacket | None) -> None:
+    """Ignore an answer, because the parameter's value shows it."""

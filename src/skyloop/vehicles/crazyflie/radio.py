@@ -1,8 +1,8 @@
 """A Crazyradio (PA or 2.0) on USB, and its vehicles, which it talks to in turns.
 
-A vehicle answers each packet with an acknowledgement that may carry a packet of its own; the radio polls with null
-packets when there is nothing to send. With the *safe link*, two bits in the header count the packets in each direction,
-so that a packet whose acknowledgement was lost is repeated and not obeyed twice.
+A vehicle acknowledges each packet, and the acknowledgement may contain a packet from the vehicle. Without a packet to
+send, the radio polls with null packets. With the *safe link*, two bits in the header count the packets in each
+direction, so that a packet whose acknowledgement was lost is repeated and not obeyed twice.
 
 Bitcraze describes the radio's USB requests at
 https://www.bitcraze.io/documentation/repository/crazyradio-firmware/master/functional-areas/usb_radio_protocol/.
@@ -253,15 +253,18 @@ class RadioLease:
                 del _radios[self.radio.number]
 
 
-def lease(address: RadioAddress, open_dongle: Callable[[int], Dongle] = UsbDongle) -> RadioLease:
-    """Open a radio, or share an open one. Raises ``OSError`` if it can't be used, or its channel is another's."""
+def lease(address: RadioAddress, open_dongle: Callable[[int], Dongle] | None = None) -> RadioLease:
+    """Open a radio, or share an open one. Raises ``OSError`` if it can't be used.
+
+    ``open_dongle`` opens the Crazyradio of a number; by default, through USB.
+    """
     ours, theirs = _pair()
     vehicle = RadioVehicle(address, theirs)
     try:
         with _lock:
             radio = _radios.get(address.dongle)
             if radio is None or radio.error is not None:
-                radio = _radios[address.dongle] = Radio(address.dongle, open_dongle(address.dongle))
+                radio = _radios[address.dongle] = Radio(address.dongle, (open_dongle or UsbDongle)(address.dongle))
             radio.add(vehicle)
     except OSError:
         ours.close()
