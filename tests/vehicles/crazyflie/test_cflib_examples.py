@@ -46,7 +46,7 @@ EXAMPLES = [
     Example("step-by-step/sbs_connect_log_param.py", prints="stabilizer.estimator set at number: 1"),
     Example("logging/basiclog.py", prints="pm.vbat: 4."),
     Example("logging/basiclog_sync.py", prints="'stabilizer.yaw'"),
-    Example("parameters/basicparam.py", prints="Write: pid_attitude.pitch_kd="),
+    Example("parameters/basicparam.py", prints="Read back: pid_attitude.pitch_kd=0.123"),
     Example("parameters/persistent_params.py", prints="Persisted ring.effect!"),
     Example("step-by-step/sbs_motion_commander.py", (0.3, 0.7), (0.0, 1.5), "Deck is attached!"),
     Example("autonomy/motion_commander_demo.py", (0.5, 1.1), (0.6, 1.6)),
