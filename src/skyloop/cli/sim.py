@@ -60,8 +60,8 @@ def sim(
         list[AutopilotKind] | None,
         typer.Option(
             metavar="KIND",
-            help="Fly with real firmware: ardupilot, betaflight or px4, the program named by SKYLOOP_ARDUCOPTER, "
-            "SKYLOOP_BETAFLIGHT or SKYLOOP_PX4; repeat it to assign several to the drones in turn",
+            help="Fly with real firmware: ardupilot, betaflight, crazyflie or px4, whose program SKYLOOP_ARDUCOPTER, "
+            "SKYLOOP_BETAFLIGHT, SKYLOOP_CRAZYFLIE or SKYLOOP_PX4 names; repeat it to give the drones several in turn",
         ),
     ] = None,
     network: net.ServeOption = None,
@@ -107,7 +107,7 @@ def sim(
 ) -> None:
     """Simulate drones that see one another in one world until Ctrl-C; each has its own proxy.
 
-    With --autopilot, the drones are flown by real ArduCopter, PX4 or Betaflight (docs/autopilots.md). With --firmware,
+    With --autopilot, the drones are flown by the firmware of real vehicles (docs/autopilots.md). With --firmware,
     each is instead an emulation of a real drone's firmware on the network, for any program that can fly it.
 
     Examples: skyloop sim --drones 2; SKYLOOP_ARDUCOPTER=bin/arducopter skyloop sim --autopilot ardupilot --option

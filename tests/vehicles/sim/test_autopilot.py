@@ -77,6 +77,7 @@ def happened(sink: RecordingSink, reason: str, times: int = 1) -> bool:
         ("sim://?autopilot=ardupilo", "no autopilot of sim:// named 'ardupilo'; did you mean 'ardupilot'"),
         ("sim://?autopilot=px4&vehicle=ardrone", "firmware needs a vehicle with rotors"),
         ("sim://?autopilot=betaflight&speed=2", "Betaflight uses the computer's clock: speed must be 1, not 2"),
+        ("sim://?autopilot=crazyflie&speed=0.5", "Crazyflie uses the computer's clock: speed must be 1, not 0.5"),
         ("sim://?autopilot=px4&native=attitude", "native is an option of the built-in autopilot, but px4 flies"),
         ("sim://?autopilot_folder=/tmp", "give autopilot=… as well"),
         ("sim://?autopilot=ardupilot&takeof_altitude=2", "no option of mavlink:// named 'takeof_altitude'"),
@@ -88,7 +89,7 @@ def test_invalid_addresses_are_refused(uri: str, message: str) -> None:
 
 
 def test_the_vehicle_suits_the_firmware() -> None:
-    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER)):
+    for autopilot, vehicle in (("ardupilot", IRIS), ("px4", IRIS), ("betaflight", RACER), ("crazyflie", CRAZYFLIE)):
         options = options_of(parse_uri(f"sim://?autopilot={autopilot}"))
         assert options.parameters == vehicle
         assert options.autopilot == autopilot

@@ -60,7 +60,7 @@ class SimDriver(Driver):
     axes. ``sim.time_s`` is the simulation's own time.
 
     With ``autopilot`` in the address, real firmware flies the drone. Capabilities, feedback and most parameters are
-    then those of the firmware's driver (``mavlink://``, ``msp://``); everything else works as for any simulated drone.
+    then those of the firmware's driver, such as ``mavlink://``; everything else works as for any simulated drone.
     See ``docs/autopilots.md``.
 
     Args:

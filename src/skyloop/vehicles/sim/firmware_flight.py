@@ -38,10 +38,12 @@ from skyloop.vehicles.sim.telemetry import truth_at
 _SOMEWHERE: Final = {
     **dict.fromkeys((AutopilotKind.ARDUPILOT, AutopilotKind.PX4), "mavlink://udpin:127.0.0.1:14550"),
     AutopilotKind.BETAFLIGHT: "msp://tcp:127.0.0.1:5761",
+    AutopilotKind.CRAZYFLIE: "crazyflie://udp:127.0.0.1",
 }
 _NAMES: Final = {
     AutopilotKind.ARDUPILOT: "ArduCopter",
     AutopilotKind.BETAFLIGHT: "Betaflight",
+    AutopilotKind.CRAZYFLIE: "Crazyflie",
     AutopilotKind.PX4: "PX4",
 }
 _ERRORS: Final = (FirmwareEventKind.SILENT, FirmwareEventKind.DIED, FirmwareEventKind.FAILED)
@@ -106,7 +108,9 @@ class FirmwareFlight:
         if folder is not None and host.drones > 1:
             folder /= f"drone{drone + 1}"  # each drone has its own settings
         instruments = rotors_of(host.simulation.parameters[drone]).instruments
-        self._firmware = firmware = make_firmware(self.kind, self._happened, instruments=instruments, folder=folder)
+        self._firmware = firmware = make_firmware(
+            self.kind, self._happened, instruments=instruments, position=self._options.position, folder=folder
+        )
         self._linked, self._found = True, False
         sink.link(LinkState.CONNECTING, self._starting)
         firmware.start()
@@ -248,9 +252,10 @@ def make_firmware(
     on_event: Callable[[FirmwareEvent], None],
     *,
     instruments: InstrumentParameters,
+    position: bool = True,
     folder: Path | None = None,
 ) -> CoupledFirmware:
-    """Return the firmware, not started yet."""
+    """Return the firmware, not started yet; ``position`` is whether a Crazyflie gets its true position."""
     if kind is AutopilotKind.ARDUPILOT:
         from skyloop.vehicles.sim.firmware.ardupilot import ArduCopter
 
@@ -259,6 +264,10 @@ def make_firmware(
         from skyloop.vehicles.sim.firmware.px4 import Px4
 
         return Px4(on_event, folder=folder, instruments=instruments)
+    if kind is AutopilotKind.CRAZYFLIE:
+        from skyloop.vehicles.sim.firmware.crazyflie import Crazyflie
+
+        return Crazyflie(on_event, folder=folder, position=position)
     from skyloop.vehicles.sim.firmware.betaflight import Betaflight
 
     return Betaflight(on_event, folder=folder)

@@ -12,7 +12,7 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FPV_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.options import EVERY_ACTION, MOST_LAG_S, SimOptions
 from skyloop.sim.vehicles import VEHICLES
-from skyloop.vehicles.sim.firmware import AutopilotKind
+from skyloop.vehicles.sim.firmware import REAL_TIME, AutopilotKind
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA, FPV_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
@@ -25,6 +25,7 @@ KNOWN: Final = {
 AUTOPILOT_VEHICLES: Final = {
     AutopilotKind.ARDUPILOT: "iris",
     AutopilotKind.BETAFLIGHT: "racer",
+    AutopilotKind.CRAZYFLIE: "crazyflie",
     AutopilotKind.PX4: "iris",
 }
 #: Firmware on the computer's clock can't catch up: world time would fall behind, and images would appear old.
@@ -51,8 +52,8 @@ def options_of(uri: VehicleUri) -> SimOptions:
     if autopilot is not None and VEHICLES[vehicle].rotors is None:
         raise UsageError(f"{uri}: firmware needs a vehicle with rotors, such as vehicle=iris, not {vehicle}")
     speed = uri.number("speed", 1.0, minimum=0.01, maximum=100.0)
-    if autopilot is AutopilotKind.BETAFLIGHT and speed != 1.0:
-        raise UsageError(f"{uri}: Betaflight uses the computer's clock: speed must be 1, not {speed:g}")
+    if autopilot in REAL_TIME and speed != 1.0:
+        raise UsageError(f"{uri}: {autopilot.capitalize()} uses the computer's clock: speed must be 1, not {speed:g}")
     noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
     return SimOptions(
         world="room" if world is None else world,
@@ -68,7 +69,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         velocity=options.get("velocity") != "none" and uri.flag("velocity", default=True),
         truth=uri.flag("truth", default=True),
         rate_hz=TRUTH_HZ if autopilot is not None else uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
-        most_lag_s=REAL_TIME_LAG_S if autopilot is AutopilotKind.BETAFLIGHT else MOST_LAG_S,
+        most_lag_s=REAL_TIME_LAG_S if autopilot in REAL_TIME else MOST_LAG_S,
         parameters=VEHICLES[vehicle],
         autopilot=None if autopilot is None else autopilot.value,
         autopilot_folder=uri.reveal("autopilot_folder"),

