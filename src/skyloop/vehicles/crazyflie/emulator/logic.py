@@ -27,7 +27,8 @@ BOOT_TEXT: Final = "SYS: ----------------------------\nSYS: Crazyflie 2.1 is up 
 MAX_BLOCKS: Final = 16
 MAX_VARIABLES: Final = 128  #: in all log blocks together
 _TRAJECTORY_TYPE, _TESTER_TYPE = 0x12, 0x15
-_MEMORIES: Final = ((_TRAJECTORY_TYPE, 4096), (_TESTER_TYPE, 20480))  # type and size of each memory
+_MEMORIES: Final = (_TRAJECTORY_TYPE, _TESTER_TYPE)  # type of each memory
+_MEMORY_SIZE: Final = 4096
 _MOST_READ: Final = 24  # bytes of a memory in one packet
 _NUMBER, _MEMORY_INFO = 1, 2  # requests on MEMORY's first channel
 _CONSOLE_BYTES: Final = 30
@@ -123,7 +124,7 @@ class CrazyflieLogic:
                 if channel == crtp.ECHO:
                     yield packet
                 elif channel == crtp.SOURCE:
-                    yield CrtpPacket(port, channel, crtp.SOURCE_TEXT.ljust(crtp.MAX_DATA, b"\0"))
+                    yield CrtpPacket(port, channel, crtp.SOURCE_TEXT.ljust(crtp.MAX_SENT_DATA, b"\0"))
             case CrtpPort.PARAMETERS:
                 yield from self._parameter_answers(packet)
             case CrtpPort.LOG:
@@ -351,24 +352,23 @@ class CrazyflieLogic:
             if data[0] == _NUMBER:
                 yield CrtpPacket(packet.port, packet.channel, bytes((_NUMBER, len(_MEMORIES))))
             elif data[0] == _MEMORY_INFO:
-                row = b"" if data[1] >= len(_MEMORIES) else struct.pack("<BIQ", *_MEMORIES[data[1]], 0)
+                row = b"" if data[1] >= len(_MEMORIES) else struct.pack("<BIQ", _MEMORIES[data[1]], _MEMORY_SIZE, 0)
                 yield CrtpPacket(packet.port, packet.channel, data[:2] + row)
             return
         number, address = struct.unpack_from("<BI", data)
         reads = packet.channel == crtp.MEMORY_READ
         length = data[5] if reads else len(data) - 5
-        type_, size = _MEMORIES[number] if number < len(_MEMORIES) else (0, 0)
-        fits = address + length <= size and length <= _MOST_READ + 1
+        fits = number < len(_MEMORIES) and address + length <= _MEMORY_SIZE and length <= _MOST_READ + 1
         status = bytes((CrtpError.NONE if fits else 5,))  # EIO
         content = b""
         if fits and reads:
-            content = self._read(type_, address, length)
-        elif fits and type_ == _TRAJECTORY_TYPE:
+            content = self._read(number, address, length)
+        elif fits and _MEMORIES[number] == _TRAJECTORY_TYPE:
             self.flight.memory[address : address + length] = data[5:]
         yield CrtpPacket(packet.port, packet.channel, data[:5] + status + content)
 
-    def _read(self, type_: int, address: int, length: int) -> bytes:
-        if type_ == _TRAJECTORY_TYPE:
+    def _read(self, number: int, address: int, length: int) -> bytes:
+        if _MEMORIES[number] == _TRAJECTORY_TYPE:
             return bytes(self.flight.memory[address : address + length])
         return bytes(place & 0xFF for place in range(address, address + length))
 

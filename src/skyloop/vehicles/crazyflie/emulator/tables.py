@@ -58,7 +58,7 @@ imu_sensors: uint8 BMP388!=1 imu_tests: uint8 MPU6500!=1
 crtpsrv: uint16 echoDelay
 memTst: uint8 resetW
 supervisor: uint8 infdmp uint16 landedTimeout*=3000
-stabilizer: uint8 stop estimator*=2 controller*=1
+stabilizer: uint8 stop estimator=2 controller=1
 commander: uint8 enHighLevel
 flightmode: uint8 althold poshold posSet yawMode=2 stabModeRoll=1 stabModePitch=1 stabModeYaw
 cppm: float rateRoll*=720 ratePitch*=720 angPitch*=50 angRoll*=50 rateYaw*=400
