@@ -22,7 +22,7 @@ from skyloop.sim.world_file import load_world
 from skyloop.vehicles.crazyflie.cache import ContentsCache
 from skyloop.vehicles.crazyflie.options import CrazyflieOptions, LinkKind
 from skyloop.vehicles.crazyflie.protocol import CrazyflieSession
-from skyloop.vehicles.crazyflie.wire.commander import Message, decode_message
+from skyloop.vehicles.crazyflie.wire.commander import EmergencyStopMessage, Message, decode_message
 from skyloop.vehicles.crazyflie.wire.crtp import HELLO, CrtpPacket
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 
@@ -47,6 +47,7 @@ class Rig:
         self.deaf = False  # it receives nothing, but sends
         self.mute = False  # it receives, but sends nothing
         self.sent: list[tuple[float, Message]] = []  # what the driver sent to fly or stop the vehicle, with its time
+        self.stops: set[int] = set()  # ports that an emergency stop was sent to
         self.asked = 0  # number of datagrams sent
         self.waiting: list[bytes] = []
         self._chance = random.Random(7)
@@ -85,6 +86,8 @@ class Rig:
             self.asked += 1
             packet = CrtpPacket.decode(datagram)
             message = decode_message(packet)
+            if isinstance(message, EmergencyStopMessage):
+                self.stops.add(packet.port)
             if message is not None:
                 self.sent.append((self.now_ns / NS_PER_S, message))
             if self.on and not self.deaf and self._chance.random() >= self._lost:

@@ -85,7 +85,8 @@ def test_both_forms_of_the_estimate_agree(roll: float, pitch: float, yaw: float)
 
 
 def test_variables_are_chosen_from_what_there_is() -> None:
-    entries = [Entry(i, *name.split("."), ValueType.FLOAT) for i, name in enumerate((*MAIN[3], "pm.vbat", "a.b"))]
+    names = [name.split(".") for name in (*MAIN[3], "pm.vbat", "a.b")]
+    entries = [Entry(number, group, name, ValueType.FLOAT) for number, (group, name) in enumerate(names)]
     main, slow = choose_variables(entries)
     assert tuple(entry.full_name for entry in main) == MAIN[3]
     assert [entry.full_name for entry in slow] == ["pm.vbat"]

@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -243,6 +244,10 @@ class EmulatedPeer(Peer):
         return answer
 
 
+def _fed(sink: RecordingSink) -> bool:
+    return sink.feedback_count > 20
+
+
 def test_drivers_share_a_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     dongle = FakeDongle({ONE: EmulatedPeer(tmp_path), TWO: EmulatedPeer(tmp_path)}, lost=0.05)
@@ -255,7 +260,7 @@ def test_drivers_share_a_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         drivers[-1].open(sinks[-1])
     try:
         for sink in sinks:
-            assert sink.wait(lambda sink=sink: sink.feedback_count > 20, 60.0), sink.links
+            assert sink.wait(partial(_fed, sink), 60.0), sink.links
             assert sink.newest is not None
             assert sink.newest.position_m is not None
             assert not sink.problems

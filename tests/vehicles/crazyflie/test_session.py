@@ -6,6 +6,8 @@ import math
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skyloop.errors import DriverError
 from skyloop.messages import (
@@ -20,10 +22,14 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.vehicles.crazyflie.cache import ContentsCache
 from skyloop.vehicles.crazyflie.options import CrazyflieOptions, LinkKind, VelocityMode
-from skyloop.vehicles.crazyflie.wire.commander import GoTo, HighLevelTakeoff, NotifySetpointsStop
+from skyloop.vehicles.crazyflie.protocol import CrazyflieSession, Stage
+from skyloop.vehicles.crazyflie.telemetry import MAIN
+from skyloop.vehicles.crazyflie.wire.commander import GoTo, HighLevelTakeoff, NotifySetpointsStop, decode_message
+from skyloop.vehicles.crazyflie.wire.contents import Entry, ValueType
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket, CrtpPort
-from tests.vehicles.crazyflie.rig import Rig
+from tests.vehicles.crazyflie.rig import OPTIONS, Rig
 
 MOTORS = {"HighLevelTakeoff", "HighLevelLand", "GoTo", "HoverSetpoint", "ZDistanceSetpoint", "Arm"}
 
@@ -92,6 +98,28 @@ def test_a_lost_vehicle_is_found_again(tmp_path: Path) -> None:
     rig.run(1.0)
     assert rig.state is FlightState.LANDED
     assert not MOTORS.intersection(rig.kinds())
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0, 2, 5, 8, 9, 13, 15]), st.integers(0, 3), st.binary(max_size=31)), max_size=40
+    ),
+    st.booleans(),
+)
+def test_no_packet_raises_anything_or_starts_a_motor(packets: list[tuple[int, int, bytes]], asking: bool) -> None:
+    session = CrazyflieSession(OPTIONS, 0, cache=ContentsCache(Path("/nonexistent")))
+    now_ns = 0
+    session.on_datagram(b"\xf3", now_ns)
+    names = [name.split(".") for name in MAIN[2]]
+    entries = [Entry(number, group, name, ValueType.FLOAT) for number, (group, name) in enumerate(names)]
+    if not asking:
+        session._stage, session._blocks, session._main = Stage.LOGGING, {0: entries[:6], 1: entries[6:]}, 1
+    for port, channel, data in packets:
+        now_ns += 10_000_000
+        session.on_datagram(CrtpPacket(port, channel, data).encode(), now_ns)
+        sent = [decode_message(CrtpPacket.decode(each)) for each in session.poll(now_ns)]
+        assert not any(sent)
+        session.drain()
 
 
 # Starting no motor ---------------------------------------------------------------------------------------------------
@@ -189,11 +217,20 @@ def test_an_emergency_stop_is_sent_until_it_is_seen(tmp_path: Path) -> None:
     assert len(rig.sent) == sent
     with pytest.raises(DriverError, match="reset"):
         rig.apply(Takeoff())
+    with pytest.raises(DriverError, match="switch it off"):
+        rig.apply(ResetEmergency())
     rig.restart()  # by hand, as a locked vehicle needs
     rig.run(4.0)
     assert rig.state is FlightState.EMERGENCY
     rig.apply(ResetEmergency())
     rig.until(lambda: rig.state is FlightState.LANDED, 3.0)
+
+
+def test_a_stop_for_a_vehicle_of_unknown_version_is_sent_in_all_layouts(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.mute = True
+    rig.apply(EmergencyStop())
+    assert rig.stops == {CrtpPort.LOCALISATION, CrtpPort.SUPERVISOR}
 
 
 # Flying --------------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ class ContentsCache:
             checksum, rest = struct.unpack_from("<I", content)[0], content[4:]
             if zlib.crc32(rest) != checksum:
                 return None
-            entries = []
+            entries: list[Entry] = []
             while rest:
                 entry = decode_contents(CrtpPacket.decode(rest[1 : 1 + rest[0]]))
                 if not isinstance(entry, Entry) or entry.number != len(entries):

@@ -36,6 +36,7 @@ from skyloop.vehicles.crazyflie.telemetry import (
 )
 from skyloop.vehicles.crazyflie.wire import contents
 from skyloop.vehicles.crazyflie.wire.commander import (
+    EmergencyStopMessage,
     ExternalPoseMessage,
     Message,
     Recover,
@@ -67,7 +68,7 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
 
 PATIENCE_NS: Final = nanoseconds(0.25)  #: time allowed for an answer
 TRIES: Final = 20  #: number of times a request is sent
-FEW_TRIES: Final = 4  #: the same for a request with a waiting caller, or unknown to old firmware
+FEW_TRIES: Final = 4  #: the same for a request with a waiting caller, or that old firmware may not answer
 WINDOW: Final = 4  #: number of requests under way at once: firmware keeps few packets
 TICK_NS: Final = nanoseconds(0.02)
 HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to connect
@@ -144,8 +145,10 @@ class CrazyflieSession(VehicleSession):
         self.options = options
         self.telemetry = CrazyflieTelemetry()
         self.setpoints = CrazyflieSetpoints(self.telemetry, options.velocity, dict(options.limits))
+        self.setpoints.restartable = options.kind is LinkKind.RADIO
         self.counts = Counter(dict.fromkeys(("received", "damaged", "late", "unanswered"), 0))
         self.protocol = NEWEST_PROTOCOL
+        self._knows_protocol = False
         self.firmware = ""
         self.device = ""
         self.values: dict[int, float] = {}  #: the parameters' values that are known, by number
@@ -176,7 +179,7 @@ class CrazyflieSession(VehicleSession):
     @property
     def protocol_text(self) -> str:
         """The protocol's version as text; empty until it is known."""
-        return str(self.protocol) if self.device else ""
+        return str(self.protocol) if self._knows_protocol else ""
 
     # From the driver -----------------------------------------------------------------------------------------------
 
@@ -323,27 +326,32 @@ class CrazyflieSession(VehicleSession):
         self._enabled = False
         self.due_ns = 0
         for query in VersionQuery:
-            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), FEW_TRIES)
+            # Old firmware names no device, and ESP-Drone's no version.
+            may_miss = query is not VersionQuery.PROTOCOL or self.options.checksum
+            tries = 2 * FEW_TRIES if may_miss else TRIES
+            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), tries)
 
     def _on_version(self, query: VersionQuery, answer: CrtpPacket | None) -> None:
         if answer is not None:
             _, number, text = decode_version_answer(answer)
         if self._abandoned:
             return
-        if query is VersionQuery.PROTOCOL:
-            self.protocol = number if answer is not None else 0
+        if query is VersionQuery.PROTOCOL and answer is None and not self.options.checksum:
+            self._restart("it does not answer")
+        elif query is VersionQuery.PROTOCOL:
+            self.protocol, self._knows_protocol = number if answer is not None else 0, True
             if not OLDEST_PROTOCOL <= self.protocol <= NEWEST_PROTOCOL:
                 text = (
                     f"the vehicle speaks version {self.protocol} of its protocol; "
                     f"Skyloop knows {OLDEST_PROTOCOL} to {NEWEST_PROTOCOL}"
                 )
                 self._publish_event(message(text, "protocol", Severity.WARNING, version=self.protocol))
+            for table in (self.parameters, self._log):
+                self.ask(contents.ask_info(table.port), b"\x03", partial(self._on_info, table))
         elif query is VersionQuery.FIRMWARE and answer is not None:
             self.firmware = text
         elif query is VersionQuery.DEVICE:
             self.device = text if answer is not None else ""
-            for table in (self.parameters, self._log):
-                self.ask(contents.ask_info(table.port), b"\x03", partial(self._on_info, table))
 
     def _on_info(self, table: Table, answer: CrtpPacket | None) -> None:
         info = None if answer is None else contents.decode_contents(answer)
@@ -458,7 +466,11 @@ class CrazyflieSession(VehicleSession):
         self.due_ns = now_ns + TICK_NS
         packets = list(self._urgent)
         self._urgent.clear()
-        packets += [self._framed(each.encode(self.protocol)) for each in self._messages(now_ns)]
+        for each in self._messages(now_ns):
+            # Before the version is known, a stop is sent in all layouts.
+            unknown = isinstance(each, EmergencyStopMessage) and not self._knows_protocol
+            versions = [self.protocol] if not unknown else [OLDEST_PROTOCOL, NEWEST_PROTOCOL]
+            packets += [self._framed(each.encode(version)) for version in versions]
         packets += self._power(now_ns)
         if self._stage is Stage.CALLING:
             if now_ns - self._called_ns >= HELLO_NS:

@@ -109,7 +109,8 @@ class CrazyflieSetpoints:
         self.limits = limits
         self.receiving = False  #: whether the vehicle's state is arriving
         self.stop = MotorStop(self._leave_alone)
-        self.reset_wanted = False  #: whether the vehicle must be restarted to end a stop
+        self.restartable = False  #: whether the link can restart the vehicle
+        self.reset_wanted = False  #: whether the vehicle must be restarted, or recover from a crash, to end a stop
         self.left_alone = False  #: after an abandoned stop or landing, until a new action
         self._mode = velocity
         self._decision = Decision.STAY
@@ -310,6 +311,8 @@ class CrazyflieSetpoints:
     def _reset(self) -> None:
         if self.stop.active and not self.receiving:
             raise DriverError("no data from the vehicle: cannot tell whether it is on the ground")
+        if self.telemetry.is_locked and not self.restartable:
+            raise DriverError("the vehicle is locked: switch it off and on again, then reset the emergency")
         self.stop.reset()
         self._steering = False
         self.reset_wanted = bool(self.telemetry.is_locked or self.telemetry.is_set(Supervisor.IS_CRASHED))

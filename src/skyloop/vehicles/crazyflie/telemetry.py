@@ -71,34 +71,31 @@ class Estimate:
 
 
 def estimate_of(values: Mapping[str, float]) -> Estimate:
-    if "stateEstimateZ.quat" in values:
-        x, y, z, w = decompressed(int(values["stateEstimateZ.quat"]))
-        # ratePitch is positive with the nose rising, like the pitch of the oldest set-point.
-        rates = (
-            values["stateEstimateZ.rateRoll"] / 1000,
-            -values["stateEstimateZ.ratePitch"] / 1000,
-            values["stateEstimateZ.rateYaw"] / 1000,
-        )
+    packed = values.get("stateEstimateZ.quat")
+    if packed is not None:
+        x, y, z, w = decompressed(int(packed))
+        rates = _vector(values, "stateEstimateZ.rate", ("Roll", "Pitch", "Yaw"), 1000)
         return Estimate(
             position_m=_vector(values, "stateEstimateZ.", "xyz", 1000),
             velocity_m_s=_vector(values, "stateEstimateZ.v", "xyz", 1000),
             roll_rad=math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
             pitch_rad=math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
             yaw_rad=math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-            rates_rad_s=rates,
+            # The pitch rate is positive with the nose rising, like the pitch of the other form.
+            rates_rad_s=None if rates is None else (rates[0], -rates[1], rates[2]),
         )
-    if "stateEstimate.yaw" not in values:
-        return Estimate()
+    angles = _vector(values, "stateEstimate.", ("roll", "pitch", "yaw"))
+    roll, pitch, yaw = (None, None, None) if angles is None else map(math.radians, angles)
     return Estimate(
         position_m=_vector(values, "stateEstimate.", "xyz"),
         velocity_m_s=_vector(values, "stateEstimate.v", "xyz"),
-        roll_rad=wrap_angle(math.radians(values["stateEstimate.roll"])),
-        pitch_rad=wrap_angle(-math.radians(values["stateEstimate.pitch"])),  # reported with the nose up positive
-        yaw_rad=wrap_angle(math.radians(values["stateEstimate.yaw"])),
+        roll_rad=None if roll is None else wrap_angle(roll),
+        pitch_rad=None if pitch is None else wrap_angle(-pitch),
+        yaw_rad=None if yaw is None else wrap_angle(yaw),
     )
 
 
-def _vector(values: Mapping[str, float], prefix: str, names: str, scale: float = 1.0) -> Vector | None:
+def _vector(values: Mapping[str, float], prefix: str, names: Sequence[str], scale: float = 1.0) -> Vector | None:
     found = tuple(values.get(f"{prefix}{name}", math.nan) / scale for name in names)
     return (found[0], found[1], found[2]) if all(map(math.isfinite, found)) else None
 
@@ -118,7 +115,7 @@ class CrazyflieTelemetry:
         self.__init__()  # type: ignore[misc]
 
     def update(self, values: Mapping[str, float], now_ns: int) -> None:
-        self.values.update(values)
+        self.values.update({name: value for name, value in values.items() if math.isfinite(value)})
         self.estimate = estimate_of(self.values)
         if self.motors_run or self.values.get("stabilizer.thrust", 0.0) > 0:
             self._powered_ns = now_ns
@@ -187,13 +184,12 @@ class CrazyflieTelemetry:
         if velocity is not None and estimate.yaw_rad is not None:
             velocity = (*turned(velocity[0], velocity[1], -estimate.yaw_rad), velocity[2])
         level = values.get("pm.batteryLevel")
-        native: dict[str, Value] = {name: value for name, value in values.items() if math.isfinite(value)}
-        native.update(further)
+        native: dict[str, Value] = {**values, **further}
         return Feedback(
             captured_ns=captured_ns,
             state=state,
             battery=None if level is None or volts <= 0 else min(1.0, level / 100),
-            battery_v=volts if volts > 0 and math.isfinite(volts) else None,
+            battery_v=volts if volts > 0 else None,
             roll_rad=estimate.roll_rad,
             pitch_rad=estimate.pitch_rad,
             yaw_rad=None if estimate.yaw_rad is None else wrap_angle(estimate.yaw_rad),

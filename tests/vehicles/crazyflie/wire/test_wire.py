@@ -39,7 +39,7 @@ def _value(kind: type[wire.Message], name: str) -> st.SearchStrategy[object]:
     letters = "".join(c * int(n or 1) for n, c in _groups(form))
     letter = letters[[field.name for field in fields(kind)].index(name)]
     table = {"f": FLOAT, "?": st.booleans(), "B": BYTE, "h": SHORT, "H": st.integers(0, 65535)}
-    return table.get(letter, st.integers(0, 2**32 - 1))  # type: ignore[return-value]
+    return table.get(letter, st.integers(0, 2**32 - 1))
 
 
 def _groups(form: str) -> list[tuple[str, str]]:
@@ -54,7 +54,7 @@ def _groups(form: str) -> list[tuple[str, str]]:
 
 
 MESSAGE = st.sampled_from(sorted(KINDS, key=lambda kind: kind.__name__)).flatmap(
-    lambda kind: st.builds(kind, **{field.name: _value(kind, field.name) for field in fields(kind)})  # type: ignore[arg-type]
+    lambda kind: st.builds(kind, **{field.name: _value(kind, field.name) for field in fields(kind)})
 )
 
 
