@@ -143,9 +143,10 @@ class RunningFirmware(RunningEmulator):
             packet = CrtpPacket.decode(datagram)
         except DecodeError:
             return
-        self._client = sender
-        if packet.is_null:  # a greeting, or a search for vehicles
+        if packet.is_null:  # a greeting, or a search for vehicles: the client stays
             self._send(datagram, sender)
+            return
+        self._client = sender
         for answer in self.logic.receive(packet):
             self._send(answer.encode(), sender)
 
