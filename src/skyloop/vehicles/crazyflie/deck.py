@@ -78,13 +78,14 @@ def deck_options(uri: VehicleUri) -> DeckOptions | None:
         for option in sorted(DECK_OPTIONS & uri.options.keys()):
             raise UsageError(f"{uri}: option {option} also needs deck, the address of the AI-deck")
         return None
-    host, port = host_and_port(given) or (given, PORT)
-    if not _HOST.match(host) and ":" not in host:
+    split = host_and_port(given)
+    if split is None and not _HOST.match(given):
         raise UsageError(f"{uri}: deck is {given!r} and must be HOST or HOST:PORT, such as 192.168.4.1")
     size = uri.options.get("deck_size", "324x244")
     if size not in SIZES:
         raise UsageError(f"{uri}: deck_size is {size!r} and must be one of {', '.join(SIZES)}")
     check_intrinsics(uri)
+    host, port = split or (given, PORT)
     return DeckOptions(
         uri,
         host,
