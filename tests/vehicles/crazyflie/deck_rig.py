@@ -55,9 +55,11 @@ def number_of(pixels: Pixels) -> int:
 class ShownDeck:
     """An emulated deck on a loop of its own, showing images at a rate, one after the other, while it is entered."""
 
-    def __init__(self, stream: str = "grey", faults: DeckFaults | None = None, hz: float = 100.0) -> None:
+    def __init__(
+        self, stream: str = "grey", faults: DeckFaults | None = None, hz: float = 100.0, port: int = 0
+    ) -> None:
         self._loop = Loop("deck")
-        self.deck = EmulatedDeck(self._loop, DeckSettings(stream, port=0, faults=faults or DeckFaults()))
+        self.deck = EmulatedDeck(self._loop, DeckSettings(stream, port=port, faults=faults or DeckFaults()))
         self.shown = 0
         self._hz = hz
         self._ended = threading.Event()

@@ -25,7 +25,6 @@ from skyloop.vehicles.crazyflie.deck import (
     PICTURELESS_S,
     SILENT_S,
     DeckDecoder,
-    DeckStalledError,
     DeckStamps,
     DeckStream,
     deck_options,
@@ -164,7 +163,7 @@ def test_a_silent_connection_has_stalled(wire: Wire) -> None:
     clock.advance(SILENT_S)
     assert stream.read() == []
     clock.advance(0.01)
-    with pytest.raises(DeckStalledError, match=r"nothing for 1\.5 s"):
+    with pytest.raises(TimeoutError, match=r"nothing for 1\.5 s"):
         stream.read()
 
 
@@ -176,7 +175,7 @@ def test_a_connection_that_completes_no_image_has_stalled(wire: Wire) -> None:
         assert stream.read() == []
         clock.advance(1.0)
     deck.sendall(data[n + 1 : n + 2])
-    with pytest.raises(DeckStalledError, match="no whole image"):
+    with pytest.raises(TimeoutError, match="no whole image"):
         stream.read()
 
 
@@ -351,6 +350,19 @@ def test_a_deck_that_stays_silent_is_reported_once_and_asked_again_and_again() -
 
 
 @pytest.mark.usefixtures("impatient")
+def test_a_deck_that_is_switched_on_later_is_found() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as reserved:
+        port = reserved.getsockname()[1]
+    with receiving(options(port)) as (video, sink):
+        assert sink.wait(lambda: bool(sink.events), WITHIN_S)
+        with ShownDeck(port=port):
+            assert sink.wait(lambda: sink.frame_counts["front"] > 0, WITHIN_S)
+        assert video.telemetry()["deck.stalls"] == 0
+    assert [event.data.get("reason") for event in sink.events][:2] == ["deck_unreachable", None]
+    assert "deck_restart" not in sink.events[0].text
+
+
+@pytest.mark.usefixtures("impatient")
 def test_a_hung_camera_comes_back_by_a_restart_if_the_user_allows_it() -> None:
     with ShownDeck(faults=DeckFaults(seed=3, hang=0.1)) as shown:
         with receiving(options(shown.deck.port, "&deck_restart=1")) as (video, sink):
@@ -406,7 +418,7 @@ def test_whatever_goes_wrong_only_whole_images_are_shown_and_they_come_back(stre
 def test_a_deck_whose_images_are_not_read_skips_whole_ones() -> None:
     with ShownDeck(hz=1000.0) as shown, socket.socket() as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)
-        client.connect(shown.deck.address)
+        client.connect(("127.0.0.1", shown.deck.port))
         waiting = threading.Event()
         while shown.deck.sent == 0 or shown.shown < 2 * shown.deck.sent:
             waiting.wait(0.01)

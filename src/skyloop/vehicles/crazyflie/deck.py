@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import socket
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -109,10 +108,6 @@ _READ_BYTES: Final = 1 << 16
 _WRAP: Final = 1 << 32  # the deck's clock wraps around at this value [µs]
 
 
-class DeckStalledError(TimeoutError):
-    """Raised when a connected deck sends no images."""
-
-
 class DeckStream:
     """One connection to the deck.
 
@@ -141,22 +136,18 @@ class DeckStream:
     def read(self) -> list[Coded]:
         """Return the images that arrive within :data:`POLL_S`.
 
-        Raises :class:`DeckStalledError` if none arrives for too long, and ``ConnectionError`` if the connection ends or
-        its bytes make no sense.
+        Raises ``TimeoutError`` if none arrives for too long, and ``ConnectionError`` if the connection ends or its
+        bytes make no sense.
         """
         frames: list[Coded] = []
         if wait_readable(self._socket, POLL_S):
             self._receive(frames)
         now_ns = self._clock()
         if now_ns - self._heard_ns > nanoseconds(SILENT_S):
-            raise DeckStalledError(f"the deck has sent nothing for {SILENT_S:g} s")
+            raise TimeoutError(f"the deck has sent nothing for {SILENT_S:g} s")
         if now_ns - self._picture_ns > nanoseconds(PICTURELESS_S):
-            raise DeckStalledError(f"no whole image has arrived for {PICTURELESS_S:g} s")
+            raise TimeoutError(f"no whole image has arrived for {PICTURELESS_S:g} s")
         return frames
-
-    def send(self, data: bytes) -> None:
-        """Send a few bytes. Raises ``OSError`` if they do not fit."""
-        self._socket.sendall(data)
 
     def close(self) -> None:
         """End the connection in order: closing it with unread bytes would reset it."""
@@ -292,22 +283,14 @@ _REMEDY: Final = "if reconnecting does not help, add deck_restart=1 to the addre
 
 
 class DeckVideo:
-    """Publishes the deck's newest images from :meth:`open` to :meth:`close`, and keeps reconnecting.
+    """Publishes the deck's newest images from :meth:`open` to :meth:`close`, and keeps reconnecting."""
 
-    ``dial`` opens a connection, given host, port and time limit.
-    """
-
-    def __init__(
-        self,
-        options: DeckOptions,
-        clock: Clock = monotonic_ns,
-        dial: Callable[[str, int, float], socket.socket] | None = None,
-    ) -> None:
+    def __init__(self, options: DeckOptions, clock: Clock = monotonic_ns) -> None:
         """Store the arguments. No I/O."""
         self.options = options
         self._clock = clock
-        self._dial = dial or _dial
         self._video: LiveVideo | None = None
+        self._reached = False  # whether the latest attempt to connect has succeeded
         self._futile = 0  # number of connections in a row without an image, including the current one
         self._stalls = self._restarts = 0
         self._state: tuple[DeckState, int] | None = None  # the newest state, and when it was that of the vehicle
@@ -373,19 +356,22 @@ class DeckVideo:
     # On the reading thread ---------------------------------------------------------------------------------------
 
     def _connect(self, sink: Sink, number: int) -> DeckStream:
-        stream = DeckStream(self._dial(self.options.host, self.options.port, CONNECT_S), number, self._clock)
+        self._reached = False
+        connected = socket.create_connection((self.options.host, self.options.port), CONNECT_S)
+        self._reached = True
+        stream = DeckStream(connected, number, self._clock)
         self._futile += 1
         if self.options.restarts and self._futile > FUTILE:
             self._futile = 0
-            self._restart_camera(sink, stream)
+            try:
+                connected.sendall(b"".join(encode(packet) for packet in restart_camera()))
+            finally:
+                stream.close()
+            self._report_restart(sink)
         return stream
 
-    def _restart_camera(self, sink: Sink, stream: DeckStream) -> None:
-        """Restart the camera processor, whose program hears only of connections opened afterwards."""
-        try:
-            stream.send(b"".join(encode(packet) for packet in restart_camera()))
-        finally:
-            stream.close()
+    def _report_restart(self, sink: Sink) -> None:
+        """Report a restart, and make the caller connect again: the new program hears only of later connections."""
         self._restarts += 1
         text = f"deck: reconnecting to {self.options.place} brought no images, so its camera processor is restarted"
         sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, where=_WHERE, reason="deck_restarted")
@@ -405,18 +391,12 @@ class DeckVideo:
         if event is not VideoEvent.LOST:
             event.publish(sink, _WHERE, text)
             return
-        self._stalls += 1
-        remedy = "" if self.options.restarts else f" ({_REMEDY})"
+        self._stalls += self._reached
+        remedy = f" ({_REMEDY})" if self._reached and not self.options.restarts else ""
         sink.event(
             EventKind.VEHICLE_MESSAGE,
-            f"deck: no images from {text}; reconnecting{remedy}",
+            f"deck: no images from {text}; trying again{remedy}",
             Severity.WARNING,
             where=_WHERE,
-            reason="deck_lost",
+            reason="deck_lost" if self._reached else "deck_unreachable",
         )
-
-
-def _dial(host: str, port: int, limit_s: float) -> socket.socket:
-    connected = socket.create_connection((host, port), limit_s)
-    connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    return connected

@@ -30,7 +30,7 @@ from skyloop.vehicles.crazyflie.wire.cpx import (
     restart_camera,
 )
 from skyloop.vehicles.crazyflie.wire.pictures import DeckState, Format, Picture, newer_packets, older_packets
-from skyloop.vehicles.emulation.emulator import Address, Loop, bound
+from skyloop.vehicles.emulation.emulator import Loop, bound
 from skyloop.vehicles.emulation.video import OneCamera, Piece, VideoEncoding
 
 #: The camera for images of the older program. The sensor's data sheet gives its size; the lens and its place are
@@ -178,11 +178,6 @@ class EmulatedDeck:
         """The actual TCP port."""
         return int(self._server.getsockname()[1])
 
-    @property
-    def address(self) -> Address:
-        """Where clients connect to."""
-        return self._settings.bind, self.port
-
     def hear(self, state: DeckState, at_ns: int) -> None:
         """Take the vehicle's state, which it had at a time of this host's clock [ns]. May be called from any thread."""
         self._packer.state = replace(state, heard_us=self._packer.time_us(at_ns))
@@ -190,10 +185,6 @@ class EmulatedDeck:
     def close(self) -> None:
         self._loop.forget(self._server)
         self._server.close()
-        self._drop()
-
-    def drop(self) -> None:
-        """Close the client's connection, if any."""
         self._drop()
 
     # On the encoder's thread -------------------------------------------------------------------------------------
