@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import threading
 from collections.abc import Iterator
@@ -22,8 +23,11 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie import deck as module
 from skyloop.vehicles.crazyflie.deck import (
+    DECK_OPTIONS,
+    FUTILE,
     PICTURELESS_S,
     SILENT_S,
+    SIZES,
     DeckDecoder,
     DeckStamps,
     DeckStream,
@@ -32,6 +36,7 @@ from skyloop.vehicles.crazyflie.deck import (
 from skyloop.vehicles.crazyflie.emulator.deck import DeckFaults, DeckPacker, to_grey
 from skyloop.vehicles.crazyflie.wire.cpx import Counting, Packet, PacketParser, encode, restart_camera
 from skyloop.vehicles.crazyflie.wire.pictures import Format, Picture, newer_packets, older_packets
+from tests.support.pages import rows, section
 from tests.vehicles.crazyflie.deck_rig import (
     WITHIN_S,
     ScriptedDeck,
@@ -443,3 +448,19 @@ def test_the_older_program_is_told_apart_by_its_packets(wire: Wire) -> None:
     deck.sendall(on_wire(older_packets(picture)))
     (coded,) = all_of(stream, 1)
     assert coded.data == picture
+
+
+# Its page ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_has_the_options_and_times() -> None:
+    text = section("docs/crazyflie.md", "## The AI-deck's camera")
+    told = {name for row in rows(text) for name in re.findall(r"`([^`]+)`", row[0])}
+    assert told >= DECK_OPTIONS
+    assert f"after {SILENT_S:g} s without a byte, or {PICTURELESS_S:g} s without a whole" in text
+    first, last = live_video.RETRY_S[0], live_video.RETRY_S[-1]
+    assert f"again after {first:g} s, then after growing pauses of up to {last:g} s" in text
+    assert FUTILE == 3
+    assert "three\nconnections in a row without an image" in text
+    for size in SIZES:
+        assert f"`{size}`" in text

@@ -35,7 +35,7 @@ class Target(IntEnum):
 
 
 class Function(IntEnum):
-    """What a packet is for. Applications may use other numbers below 64."""
+    """The purpose of a packet. Applications may use other numbers below 64."""
 
     SYSTEM = 1
     CONSOLE = 2

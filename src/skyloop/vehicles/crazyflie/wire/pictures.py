@@ -1,8 +1,8 @@
 """The AI-deck's images in CPX packets: packets in, images out, and the reverse. Pure.
 
-The layouts come from Bitcraze's public examples for the AI-deck. ``wifi-img-streamer`` announces each image in a packet
-of its own, and continues with as many packets of data as it takes. ``nanocockpit`` (its messages are version 10) sends
-the vehicle's state ahead of the pixels, in one buffer with an optional checksum.
+The layouts come from Bitcraze's public examples for the AI-deck. ``wifi-img-streamer`` announces each image in a separate
+packet, and continues with as many packets of data as it takes. ``nanocockpit`` (its messages are version 10) sends the
+vehicle's state ahead of the pixels, in one buffer with an optional checksum.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ class PictureAssembly:
         self.broken = 0
         self.stray = 0
         self._announced: tuple[int, int, int] | None = None  # size of the older firmware's image, and its format
-        self._data: bytearray | None = None  # what has arrived of the current image; None between images
+        self._data: bytearray | None = None  # the part of the current image that has arrived; None between images
         self._size = 0
         self._checksum = 0
         self._number = 0
