@@ -1,8 +1,8 @@
 """The AI-deck's images in CPX packets: packets in, images out, and the reverse. Pure.
 
-The layouts come from Bitcraze's public examples for the AI-deck. ``wifi-img-streamer`` announces each image in a separate
-packet, and continues with as many packets of data as it takes. ``nanocockpit`` (its messages are version 10) sends the
-vehicle's state ahead of the pixels, in one buffer with an optional checksum.
+The layouts come from Bitcraze's public examples for the AI-deck. ``wifi-img-streamer`` announces each image in a
+separate packet, and continues with as many packets of data as it takes. ``nanocockpit`` (its messages are version 10)
+sends the vehicle's state ahead of the pixels, in one buffer with an optional checksum.
 """
 
 from __future__ import annotations
