@@ -101,7 +101,12 @@ def sim(
     ] = None,
     video_port: Annotated[
         int | None,
-        typer.Option(metavar="P", min=1, max=65000, help="For arducopter and px4: port to send the video to"),
+        typer.Option(
+            metavar="P",
+            min=1,
+            max=65000,
+            help="For arducopter and px4: port to send the video to; for crazyflie: port of its AI-deck's images",
+        ),
     ] = None,
     fault_seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Firmware: seed of the faults [0]")] = None,
 ) -> None:
@@ -247,12 +252,12 @@ def serve(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Ser
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
-    elif serving.video_port is not None:
-        raise UsageError("--video-port is for --firmware arducopter and px4: the others have their own port")
-    elif firmware is FirmwareKind.BETAFLIGHT:
-        _run(_racers(options, drones, serving))
     elif firmware in CRAZYFLIES:
         _run(_crazyflies(options, drones, firmware, serving))
+    elif serving.video_port is not None:
+        raise UsageError("--video-port is for --firmware arducopter, crazyflie and px4: the others have their own port")
+    elif firmware is FirmwareKind.BETAFLIGHT:
+        _run(_racers(options, drones, serving))
     elif firmware is FirmwareKind.TELLO:
         _run(_tellos(options, drones, serving))
     else:
@@ -319,9 +324,9 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
 
 def _crazyflies(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[CrazyflieFirmware]:
     from skyloop.sim.host import SimHost
-    from skyloop.vehicles.crazyflie.emulator import ESP_PORT, PORT, CrazyflieFirmware, with_crazyflies
+    from skyloop.vehicles.crazyflie.emulator import ESP_PORT, PORT, CrazyflieFirmware, DeckSettings, with_crazyflies
 
-    checksum = firmware is FirmwareKind.ESP_DRONE
+    checksum, video = firmware is FirmwareKind.ESP_DRONE, serving.video_port
     usual = ESP_PORT if checksum else PORT
     base = usual if serving.port_base is None else serving.port_base
     host = SimHost(with_crazyflies(options), drones)
@@ -334,6 +339,7 @@ def _crazyflies(options: SimOptions, drones: int, firmware: FirmwareKind, servin
             checksum=checksum,
             faults=serving.faults,
             delay_s=serving.delay_s,
+            deck=None if video is None else DeckSettings(bind=serving.bind, port=video + drone),
         )
         for drone in range(drones)
     ]

@@ -11,7 +11,7 @@ To use it in a test::
         firmware.address  # for a driver: crazyflie://udp:127.0.0.1:…; for cflib: udp://127.0.0.1:…
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-It has a Flow deck, a Multi-ranger deck and an AI deck. Its estimate begins at (0, 0, 0) with yaw 0 where it stands when
+It has a Flow deck and a Multi-ranger deck, and with ``deck=DeckSettings()`` an AI-deck that sends images. Its estimate begins at (0, 0, 0) with yaw 0 where it stands when
 it is switched on. ``checksum=True`` speaks ESP-Drone's dialect, in which each packet ends with a checksum.
 """
 
@@ -29,6 +29,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.vehicles import CRAZYFLIE
+from skyloop.vehicles.crazyflie.emulator.deck import DeckSettings, EmulatedDeck
 from skyloop.vehicles.crazyflie.emulator.logic import PROTOCOL, CrazyflieLogic
 from skyloop.vehicles.crazyflie.wire.crtp import (
     NEWEST_PROTOCOL,
@@ -48,7 +49,7 @@ from skyloop.vehicles.emulation.emulator import (
 )
 from skyloop.vehicles.emulation.flight import SimulatedVehicle
 
-__all__ = ["CrazyflieFirmware", "Faults", "with_crazyflies"]
+__all__ = ["CrazyflieFirmware", "DeckSettings", "Faults", "with_crazyflies"]
 
 PORT: Final = 19850  #: UDP port of the first vehicle; programs for simulated Crazyflies look there
 ESP_PORT: Final = 2390  #: UDP port of ESP-Drone and LiteWing
@@ -81,6 +82,7 @@ class CrazyflieSettings:
     checksum: bool
     faults: Faults
     delay_s: float
+    deck: DeckSettings | None
 
 
 class RunningFirmware(RunningEmulator):
@@ -104,6 +106,7 @@ class RunningFirmware(RunningEmulator):
             protocol=settings.protocol,
             auto_arm=settings.auto_arm,
         )
+        self.deck: EmulatedDeck | None = None
         try:
             self._udp = DatagramPort(
                 self._loop,
@@ -114,11 +117,16 @@ class RunningFirmware(RunningEmulator):
                 delay_s=settings.delay_s,
             )
             self._open.append(self._udp)
+            if settings.deck is not None:
+                self.deck = EmulatedDeck(self._loop, settings.deck)
+                self._open.append(self.deck)
+                self._video = self.deck.video
+                self._video.start()
             simulation = host.simulation
             self._tick(Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns()))
             if self._own_loop:
                 self._loop.start()
-            host.attach(drone, self, self, [])
+            host.attach(drone, self, self, [] if self.deck is None else [self.deck.camera])
         except BaseException:
             self.stop()
             raise
@@ -154,6 +162,8 @@ class RunningFirmware(RunningEmulator):
         self._udp.send(with_checksum(data) if self._settings.checksum else data, to)
 
     def _tick(self, report: Report) -> None:
+        if self.deck is not None:
+            self.deck.hear(self.logic.deck_state, report.captured_ns)
         for packet in self.logic.update(report, talks=self._client is not None):
             if self._client is not None:
                 self._send(packet.encode(), self._client)
@@ -178,6 +188,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         checksum: Whether each packet ends with a checksum, as in ESP-Drone and LiteWing.
         faults: Faults injected into all datagrams in both directions.
         delay_s: Delay added to all datagrams in each direction.
+        deck: What its AI-deck sends, and where; None for no deck.
         loop: Thread shared by a fleet; None for a separate thread.
 
     Raises:
@@ -196,12 +207,15 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         checksum: bool = False,
         faults: Faults = NO_FAULTS,
         delay_s: float = 0.0,
+        deck: DeckSettings | None = None,
         loop: Loop | None = None,
     ) -> None:
         if not OLDEST_PROTOCOL <= protocol <= NEWEST_PROTOCOL:
             raise UsageError(f"protocol must be from {OLDEST_PROTOCOL} to {NEWEST_PROTOCOL}, got {protocol!r}")
         super().__init__(host, drone)
-        self.settings = CrazyflieSettings(bind, port, protocol, auto_arm, checksum, faults, checked_delay(delay_s))
+        self.settings = CrazyflieSettings(
+            bind, port, protocol, auto_arm, checksum, faults, checked_delay(delay_s), deck
+        )
         self._stored: dict[int, float] = {}
         self._loop = loop
 
@@ -214,6 +228,11 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     def port(self) -> int:
         """The actual port; if 0 was given, the system chose it."""
         return self._started.port
+
+    @property
+    def deck(self) -> EmulatedDeck | None:
+        """The running AI-deck, if any."""
+        return self._started.deck
 
     @property
     def logic(self) -> CrazyflieLogic:
@@ -229,4 +248,5 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     def description(self) -> str:
         """A readable one-line summary: kind, number and address."""
         kind = "esp-drone" if self.settings.checksum else "crazyflie"
-        return f"{kind} drone {self.drone} on {self.settings.bind}: CRTP udp {self.port}"
+        images = "" if self.deck is None else f", images tcp {self.deck.port}"
+        return f"{kind} drone {self.drone} on {self.settings.bind}: CRTP udp {self.port}{images}"

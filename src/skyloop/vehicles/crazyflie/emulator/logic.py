@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from skyloop.errors import DecodeError
-from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.messages.geometry import quaternion_from_euler, turned
 from skyloop.sim.host import Report
 from skyloop.vehicles.crazyflie.emulator.flight import CrazyflieFlight
 from skyloop.vehicles.crazyflie.emulator.tables import LOG_ROWS, OUT_OF_RANGE_MM, PARAMETER_ROWS, Snapshot, info_of
@@ -18,6 +18,7 @@ from skyloop.vehicles.crazyflie.wire import commander as wire
 from skyloop.vehicles.crazyflie.wire import contents, crtp
 from skyloop.vehicles.crazyflie.wire.contents import CrtpError, LogCommand, LogRequest, MiscCommand, MiscMessage
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket, CrtpPort
+from skyloop.vehicles.crazyflie.wire.pictures import DeckState
 from skyloop.vehicles.emulation.flight import Vehicle
 
 PROTOCOL: Final = crtp.NEWEST_PROTOCOL
@@ -86,6 +87,15 @@ class CrazyflieLogic:
 
     def parameter(self, name: str) -> float:
         return self.parameters[_NUMBERS[name]]
+
+    @property
+    def deck_state(self) -> DeckState:
+        """What the AI-deck hears of the vehicle."""
+        assert self._report is not None
+        believed, (x, y, z, yaw) = self._report.believed, self.flight.place
+        forward, left, up = believed.velocity_m_s
+        velocity = (*turned(forward, left, yaw), up)
+        return DeckState(0, (x, y, z), velocity, quaternion_from_euler(believed.roll_rad, believed.pitch_rad, yaw))
 
     # Packets ---------------------------------------------------------------------------------------------------------
 
