@@ -11,8 +11,9 @@ To use it in a test::
         firmware.address  # for a driver: crazyflie://udp:127.0.0.1:…; for cflib: udp://127.0.0.1:…
         host.simulation.truth(0).position_m  # the vehicle's true position
 
-It has a Flow deck and a Multi-ranger deck, and with ``deck=DeckSettings()`` an AI-deck that sends images. Its estimate begins at (0, 0, 0) with yaw 0 where it stands when
-it is switched on. ``checksum=True`` speaks ESP-Drone's dialect, in which each packet ends with a checksum.
+It has a Flow deck and a Multi-ranger deck, and with ``deck=DeckSettings()`` an AI-deck that sends images. Its estimate
+begins at (0, 0, 0) with yaw 0 where it stands when it is switched on. ``checksum=True`` speaks ESP-Drone's dialect, in
+which each packet ends with a checksum.
 """
 
 from __future__ import annotations
@@ -162,11 +163,11 @@ class RunningFirmware(RunningEmulator):
         self._udp.send(with_checksum(data) if self._settings.checksum else data, to)
 
     def _tick(self, report: Report) -> None:
-        if self.deck is not None:
-            self.deck.hear(self.logic.deck_state, report.captured_ns)
         for packet in self.logic.update(report, talks=self._client is not None):
             if self._client is not None:
                 self._send(packet.encode(), self._client)
+        if self.deck is not None:
+            self.deck.hear(self.logic.deck_state, report.captured_ns)
 
     def _crashed(self, text: str) -> None:
         if not text.startswith("stopped"):  # by our own command
