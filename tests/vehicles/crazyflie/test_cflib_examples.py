@@ -12,6 +12,7 @@ import re
 import shutil
 import subprocess
 import threading
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import chain, repeat
@@ -25,6 +26,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 
 PATIENCE_S = 150.0
+LANDED_WITHIN_S = 5.0  # after the end of the program, which may end while the vehicle falls the last centimetres
 RECORD_S = 0.05  # interval between recorded positions
 _RADIO = re.compile(r"radio://0/\d+/2M/E7E7E7E7[0-9A-F]{2}")
 
@@ -109,7 +111,11 @@ def test_example(example: Example, python: str, tmp_path: Path) -> None:
                 timeout=PATIENCE_S,
                 check=False,
             )
-            ended.wait(1.0)
+            until_s = time.monotonic() + LANDED_WITHIN_S
+            while time.monotonic() < until_s and any(
+                host.simulation.state(drone) is not FlightState.LANDED for drone in range(example.drones)
+            ):
+                ended.wait(RECORD_S)
         finally:
             ended.set()
             recorder.join()
