@@ -10,7 +10,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -29,6 +29,8 @@ from tests.vehicles.crazyflie.emulator.bench import Bench
 PROGRAM = os.environ.get("SKYLOOP_CRAZYFLIE", "")
 ANSWERS_WITHIN_S = 10.0
 QUIET_S = 0.4  # a request without an answer
+
+Ask = Callable[[CrtpPacket], list[bytes]]
 
 pytestmark = [
     pytest.mark.process,
@@ -115,8 +117,7 @@ def both(real: Real, bench: Bench, packet: CrtpPacket, *, answered: bool = True)
     )
 
 
-def table(ask: object, port: CrtpPort) -> dict[str, Entry]:
-    assert callable(ask)
+def table(ask: Ask, port: CrtpPort) -> dict[str, Entry]:
     info = contents.decode_contents(CrtpPacket(port, crtp.CONTENTS, ask(contents.ask_info(port))[0]))
     assert isinstance(info, ContentsInfo)
     found = {}
@@ -197,8 +198,9 @@ def test_parameters(real: Real, bench: Bench) -> None:
     theirs = table(lambda packet: real.ask(packet, ANSWERS_WITHIN_S), CrtpPort.PARAMETERS)
     ours = table(lambda packet: [answer.data for answer in bench.logic.receive(packet)], CrtpPort.PARAMETERS)
 
-    def of(name: str, make: object, within_s: float = ANSWERS_WITHIN_S) -> tuple[list[bytes], list[bytes]]:
-        assert callable(make)
+    def of(
+        name: str, make: Callable[[int], CrtpPacket], within_s: float = ANSWERS_WITHIN_S
+    ) -> tuple[list[bytes], list[bytes]]:
         answers = (
             real.ask(make(theirs[name].number), within_s),
             [answer.data for answer in bench.logic.receive(make(ours[name].number))],

@@ -48,12 +48,13 @@ class Block:
 
 
 #: First protocol version with a request, if not the oldest: port, channel, first byte.
-_SINCE: Final = {
+_SINCE: Final[dict[tuple[int, int, int], int]] = {
     (layout.port, layout.channel, layout.number): layout.since
     for kind in wire.Message.__subclasses__()
     for layout in kind.LAYOUTS
     if layout.number is not None and layout.since > crtp.OLDEST_PROTOCOL
-} | {(CrtpPort.HIGH_LEVEL, 0, 11): 8}
+}
+_SINCE[CrtpPort.HIGH_LEVEL, 0, 11] = 8  # the spiral
 
 
 class CrazyflieLogic:
