@@ -332,8 +332,25 @@ def test_a_landing_is_sent_to_a_lost_vehicle_for_a_moment(tmp_path: Path) -> Non
     rig.run(1.0)
     rig.mute = False
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 5.0)
-    rig.run(1.0)
-    assert rig.state is FlightState.LANDED
+    rig.until(lambda: rig.state is FlightState.LANDED, 6.0)
+
+
+def test_a_landed_vehicle_is_not_lifted_again(tmp_path: Path) -> None:
+    """Firmware reports a flight for seconds after the landing; a hover or a velocity must not start the motors then."""
+    rig = flying(tmp_path)
+    rig.apply(Land())
+    rig.until(
+        lambda: rig.simulation.truth(0).position_m[2] < 0.02 and not rig.simulation.feedback(0).state.airborne, 12.0
+    )
+    rig.until(lambda: rig.state is FlightState.LANDED, 1.0)
+    assert rig.session.telemetry.is_flying(rig.now_ns)
+    sent = len(rig.sent)
+    for action in (Hover(), Velocity(up=0.3), Hover(), Position(0.0, 0.0, 1.0)):
+        rig.apply(action)
+        rig.run(0.5)
+    assert not MOTORS.intersection(type(message).__name__ for _, message in rig.sent[sent:])
+    assert not rig.simulation.feedback(0).state.airborne
+    rig.until(lambda: rig.state is FlightState.LANDED, 6.0)
 
 
 def test_limits_hold(tmp_path: Path) -> None:

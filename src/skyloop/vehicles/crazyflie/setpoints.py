@@ -73,6 +73,7 @@ REFUSES_NS: Final = nanoseconds(2.5)  #: time after which a vehicle that doesn't
 RISES_NS: Final = nanoseconds(1.0)  #: time after the last take-off packet within which it may still rise
 FRESH_NS: Final = nanoseconds(0.5)  #: age of the newest state within which a take-off is sent
 SILENT_NS: Final = nanoseconds(0.35)  #: silence after which low-level set-points give way to a hover
+OFF_NS: Final = nanoseconds(0.5)  #: time without power after which a vehicle no longer flies, whatever it reports
 ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
 LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-off counts as finished
 NEAR_M: Final = 0.15
@@ -132,6 +133,8 @@ class CrazyflieSetpoints:
         self._heading_rad: float | None = None  # heading to keep on flights to places
         self._rises_until_ns = 0
         self._lands_until_ns = 0
+        self._landed = False  # whether the motors are off, after a landing or for a moment
+        self._off_ns: int | None = None  # since when the motors are off
         self._armed_ns: int | None = None  # when we last asked to arm
         self._disarm = False
         self._events: list[VehicleEvent] = []
@@ -154,7 +157,7 @@ class CrazyflieSetpoints:
     def flight_state(self, now_ns: int) -> FlightState:
         if self.stop.shown:
             return FlightState.EMERGENCY
-        flying = self.telemetry.is_flying(now_ns)
+        flying = self._flies(now_ns)
         if self._decision is Decision.LAND and (flying or now_ns < self._rises_until_ns):
             return FlightState.LANDING
         if not flying:
@@ -163,6 +166,15 @@ class CrazyflieSetpoints:
             return FlightState.TAKING_OFF
         still = self._setpoint is None or self._setpoint == Velocity() or self._arrived()
         return FlightState.HOVERING if still and self.telemetry.estimate.speed_m_s < SLOW_M_S else FlightState.FLYING
+
+    def _flies(self, now_ns: int) -> bool | None:
+        """Return whether the vehicle flies; None if unknown.
+
+        Firmware counts a vehicle as flying for seconds after a landing, when its motors are already off.
+        """
+        if self._landed and self.telemetry.motors_run is False:
+            return False
+        return self.telemetry.is_flying(now_ns)
 
     def _arrived(self) -> bool:
         position = self.telemetry.estimate.position_m
@@ -234,7 +246,7 @@ class CrazyflieSetpoints:
     def _take_off(self, now_ns: int) -> None:
         if not self.receiving or self._state_ns is None or now_ns - self._state_ns > FRESH_NS:
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
-        if self.telemetry.is_flying(now_ns):
+        if self._flies(now_ns):
             if self._decision is not Decision.TAKE_OFF:
                 self._remain(None, now_ns)
             return
@@ -244,7 +256,7 @@ class CrazyflieSetpoints:
         self._decide(Decision.TAKE_OFF, now_ns)
 
     def _remain(self, setpoint: Velocity | Attitude | Position | None, now_ns: int) -> None:
-        flying = bool(self.telemetry.is_flying(now_ns))
+        flying = bool(self._flies(now_ns))
         if self._decision is not Decision.STAY and not flying:
             return  # a take-off ends in a hover; one that a landing withdrew could still happen
         anew = self._decision is not Decision.STAY or not self._steering
@@ -333,7 +345,8 @@ class CrazyflieSetpoints:
     def on_state(self, now_ns: int) -> None:
         """Handle a new state of the telemetry."""
         self.receiving, self._state_ns = True, now_ns
-        flying = bool(self.telemetry.is_flying(now_ns))
+        self._watch_motors(now_ns)
+        flying = bool(self._flies(now_ns))
         rose, self._was_flying = self._was_flying, flying
         estimate = self.telemetry.estimate
         if self._decision is Decision.TAKE_OFF:
@@ -352,6 +365,15 @@ class CrazyflieSetpoints:
             self._setpoint, self._steering = None, False
             if self._flight is not None and rose:
                 self._flight = None
+
+    def _watch_motors(self, now_ns: int) -> None:
+        """Notice that the motors are off: at once at the end of a landing, otherwise after a moment."""
+        if self.telemetry.motors_run is not False or self._decision is Decision.TAKE_OFF:
+            self._landed, self._off_ns = False, None
+            return
+        self._off_ns = now_ns if self._off_ns is None else self._off_ns
+        landing = self._decision is Decision.LAND and now_ns >= self._rises_until_ns
+        self._landed |= landing or now_ns - self._off_ns > OFF_NS
 
     @property
     def _arms_itself(self) -> bool | None:
@@ -403,11 +425,11 @@ class CrazyflieSetpoints:
         return [*self._flown(now_ns), *steered]
 
     def _may_fly(self, now_ns: int) -> bool:
-        flying = self.telemetry.is_flying(now_ns)
+        flying = self._flies(now_ns)
         return now_ns < self._rises_until_ns or (self._was_flying if flying is None else flying)
 
     def _starting(self, now_ns: int) -> list[Message]:
-        landed = self.telemetry.is_flying(now_ns) is False
+        landed = self._flies(now_ns) is False
         if not landed:
             self._flight = None
             return []
@@ -534,7 +556,7 @@ class CrazyflieSetpoints:
         if not self.stop.settled(self._state_ns):
             return None
         running = self.telemetry.motors_run
-        return not self.telemetry.is_flying(now_ns) if running is None else not running
+        return not self._flies(now_ns) if running is None else not running
 
 
 def _eased(now: Velocity, wanted: Velocity, since_s: float) -> Velocity:

@@ -27,6 +27,7 @@ _INFO: Final = "supervisor.info"
 #: Alternatives, best first: the state in one packet, or in several.
 MAIN: Final = ((*_COMPRESSED, _INFO), _COMPRESSED, (*_PLAIN, _INFO), _PLAIN)
 _MOTORS: Final = ("motor.m1", "motor.m2", "motor.m3", "motor.m4")
+_MOTOR_OFF: Final = 1000  # power up to which a motor counts as off, of 65535
 _VARIANCES: Final = ("kalman.varPX", "kalman.varPY", "kalman.varPZ")
 SLOW: Final = (
     *("sys.isFlying", "sys.isTumbled", "sys.canfly", "sys.armed", "stabilizer.thrust"),
@@ -133,7 +134,7 @@ class CrazyflieTelemetry:
         """Whether a motor has power; None if not reported."""
         if not all(name in self.values for name in _MOTORS):
             return None
-        return any(self.values[name] > 0 for name in _MOTORS)
+        return any(self.values[name] > _MOTOR_OFF for name in _MOTORS)
 
     @property
     def is_locked(self) -> bool | None:
