@@ -49,7 +49,7 @@ def _answers(answer: CrtpPacket, request: CrtpPacket) -> bool:
 
 
 class Real:
-    """The real firmware, in a world of its own."""
+    """The real firmware in a separate world."""
 
     def __init__(self) -> None:
         started = threading.Event()

@@ -25,7 +25,7 @@ TICK_S: Final = 0.008
 
 
 class Bench:
-    """A vehicle whose time passes in ticks of 8 ms. ``sent`` lists what the firmware sent by itself."""
+    """A vehicle whose time passes in ticks of 8 ms. ``sent`` lists unsolicited packets."""
 
     def __init__(self, *, protocol: int = 12, auto_arm: bool = True) -> None:
         world = replace(load_world("empty", 0), targets=())
