@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from skyloop.vehicles.crazyflie.emulator.logic import CrazyflieLogic
-
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.vehicle_session import deliver
@@ -20,6 +18,7 @@ from skyloop.sim.simulation import Simulation
 from skyloop.sim.vehicles import CRAZYFLIE
 from skyloop.sim.world_file import load_world
 from skyloop.vehicles.crazyflie.cache import ContentsCache
+from skyloop.vehicles.crazyflie.emulator.logic import CrazyflieLogic
 from skyloop.vehicles.crazyflie.options import CrazyflieOptions, LinkKind
 from skyloop.vehicles.crazyflie.protocol import CrazyflieSession
 from skyloop.vehicles.crazyflie.wire.commander import EmergencyStopMessage, Message, decode_message
