@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from skyloop.proxy.serve import Beside
     from skyloop.sim.options import SimOptions
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+    from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware
     from skyloop.vehicles.mavlink.emulator import MavlinkFirmware
     from skyloop.vehicles.msp.emulator import BetaflightFirmware
     from skyloop.vehicles.tello.emulator import TelloFirmware
 
-    Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
+    Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | CrazyflieFirmware | MavlinkFirmware | TelloFirmware
 
 MOST_DRONES = 100  #: maximum value of --drones
 OWN_OPTIONS = ("world", "seed", "speed")
@@ -73,7 +74,8 @@ def sim(
         FirmwareKind | None,
         typer.Option(
             metavar="KIND",
-            help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
+            help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, crazyflie, "
+            "esp-drone, px4 or tello",
         ),
     ] = None,
     bind: Annotated[
@@ -216,11 +218,14 @@ class FirmwareKind(StrEnum):
     ARDRONE2 = "ardrone2"
     ARDUCOPTER = "arducopter"
     BETAFLIGHT = "betaflight"
+    CRAZYFLIE = "crazyflie"
+    ESP_DRONE = "esp-drone"
     PX4 = "px4"
     TELLO = "tello"
 
 
 MAVLINK: Final = (FirmwareKind.ARDUCOPTER, FirmwareKind.PX4)
+CRAZYFLIES: Final = (FirmwareKind.CRAZYFLIE, FirmwareKind.ESP_DRONE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,6 +251,8 @@ def serve(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Ser
         raise UsageError("--video-port is for --firmware arducopter and px4: the others have their own port")
     elif firmware is FirmwareKind.BETAFLIGHT:
         _run(_racers(options, drones, serving))
+    elif firmware in CRAZYFLIES:
+        _run(_crazyflies(options, drones, firmware, serving))
     elif firmware is FirmwareKind.TELLO:
         _run(_tellos(options, drones, serving))
     else:
@@ -307,6 +314,28 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
     host = SimHost(with_racers(options), drones)
     return [
         BetaflightFirmware(host, drone, bind=serving.bind, port=base + drone if base else 0) for drone in range(drones)
+    ]
+
+
+def _crazyflies(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[CrazyflieFirmware]:
+    from skyloop.sim.host import SimHost
+    from skyloop.vehicles.crazyflie.emulator import ESP_PORT, PORT, CrazyflieFirmware, with_crazyflies
+
+    checksum = firmware is FirmwareKind.ESP_DRONE
+    usual = ESP_PORT if checksum else PORT
+    base = usual if serving.port_base is None else serving.port_base
+    host = SimHost(with_crazyflies(options), drones)
+    return [
+        CrazyflieFirmware(
+            host,
+            drone,
+            bind=serving.bind,
+            port=base + drone if base else 0,
+            checksum=checksum,
+            faults=serving.faults,
+            delay_s=serving.delay_s,
+        )
+        for drone in range(drones)
     ]
 
 
