@@ -15,6 +15,7 @@ from skyloop.vehicles.crazyflie.link import CrazyflieLink
 from skyloop.vehicles.crazyflie.options import LinkKind, options_of
 from skyloop.vehicles.crazyflie.parameters import CrazyflieParameters
 from skyloop.vehicles.crazyflie.protocol import CrazyflieSession
+from skyloop.vehicles.crazyflie.radio import require_usb
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "position", "emergency_stop", "reset_emergency"}
@@ -36,8 +37,10 @@ class CrazyflieDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         session = CrazyflieSession(self.options, monotonic_ns())
-        if self.options.kind in (LinkKind.TCP, LinkKind.RADIO):
-            raise UsageError(f"crazyflie://{self.options.kind.value}: is not supported yet")
+        if self.options.kind is LinkKind.TCP:
+            raise UsageError(f"{self.uri}: flying over TCP is not supported yet")
+        if self.options.kind is LinkKind.RADIO:
+            require_usb()
         link = CrazyflieLink(session, lambda pending: deliver(sink, pending), serve=self.serve_link)
         self._link, self._parameters = link, CrazyflieParameters(link)
         link.start()

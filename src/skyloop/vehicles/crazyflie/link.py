@@ -1,4 +1,4 @@
-"""One vehicle's socket, and the thread that serves it. A radio's vehicles are in ``radio.py``."""
+"""One vehicle's socket, over UDP or to a Crazyradio's thread, and the thread that serves it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from skyloop.drivers.base import ExternalPose, ServedLink
 from skyloop.drivers.vehicle_link import VehicleLink
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.messages import AnyAction
+from skyloop.vehicles.crazyflie import radio
+from skyloop.vehicles.crazyflie.options import LinkKind
 from skyloop.vehicles.crazyflie.protocol import CrazyflieSession
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket
 
@@ -19,7 +21,7 @@ ASK_S: Final = 0.95  #: time limit for the answer to the write of a parameter
 
 
 class CrazyflieLink(VehicleLink[CrazyflieSession]):
-    """The link to one vehicle over UDP."""
+    """The link to one vehicle over UDP or a Crazyradio."""
 
     def __init__(
         self,
@@ -31,6 +33,7 @@ class CrazyflieLink(VehicleLink[CrazyflieSession]):
     ) -> None:
         super().__init__("skyloop-crazyflie", session, deliver, clock, family=socket.AF_UNSPEC, serve=serve)
         self._socket: socket.socket | None = None
+        self._lease: radio.RadioLease | None = None  # of a Crazyradio
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
@@ -68,6 +71,12 @@ class CrazyflieLink(VehicleLink[CrazyflieSession]):
         options = self.session.options
         with self.lock:
             self._close_sockets()
+        if options.kind is LinkKind.RADIO:
+            leased = radio.lease(options.radio)
+            with self.lock:
+                self._lease, self._socket = leased, leased.socket
+            self._watch(leased.socket, lambda: self._read_datagrams(leased.socket, self.session.on_datagram))
+            return
         host = self._lookup.address(options.host)
         made = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -83,7 +92,9 @@ class CrazyflieLink(VehicleLink[CrazyflieSession]):
     def _close_sockets(self) -> None:
         if self._socket is not None:
             self._forget(self._socket)
-        self._socket = None
+        if self._lease is not None:
+            self._lease.close()
+        self._socket = self._lease = None
 
     def _send_due(self, now_ns: int) -> None:
         for datagram in self.session.poll(now_ns):

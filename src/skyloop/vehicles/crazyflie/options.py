@@ -14,6 +14,7 @@ from skyloop.errors import UnknownNameError, UsageError
 UDP_PORT: Final = 19850  #: of the firmware for simulation, and of the emulated one
 ESP_PORT: Final = 2390
 CPX_PORT: Final = 5000
+CRAZYFLIE, ESP = "crazyflie", "esp"  #: dialects over UDP
 _EXAMPLES: Final = (
     "it should look like crazyflie://radio:0/80/2M/E7E7E7E7E7, crazyflie://udp:127.0.0.1:19850, "
     "crazyflie://esp:192.168.43.42 or crazyflie://tcp:192.168.4.1:5000"
@@ -74,7 +75,7 @@ OWN_LIMITS: Final = (
     OwnLimit("limits.yaw_rate", 1.5, 0.1, 6.0, "rad/s", "Maximum yaw rate"),
     OwnLimit("limits.tilt", 0.35, 0.02, 0.6, "rad", "Maximum roll and pitch of an attitude set-point"),
 )
-KNOWN: Final = {"velocity", "rate", *(limit.option for limit in OWN_LIMITS)}
+KNOWN: Final = {"velocity", "rate", "dialect", *(limit.option for limit in OWN_LIMITS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +107,11 @@ def options_of(uri: VehicleUri, further: frozenset[str] = frozenset()) -> Crazyf
     reject_unknown_options(uri, KNOWN | further)
     kind, _, rest = uri.place.partition(":")
     rest = rest.removeprefix("//")
+    dialect = uri.options.get("dialect", CRAZYFLIE)
+    if dialect not in (CRAZYFLIE, ESP):
+        raise UnknownNameError("dialect of crazyflie://", dialect, [CRAZYFLIE, ESP])
+    if kind == LinkKind.UDP and dialect == ESP:
+        kind = LinkKind.ESP
     if kind not in list(LinkKind):
         raise UsageError(f"{uri} does not say how to reach the vehicle; {_EXAMPLES}")
     host, port, radio = "", 0, RadioAddress()

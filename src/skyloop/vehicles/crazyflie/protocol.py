@@ -66,10 +66,11 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
 )
 
 PATIENCE_NS: Final = nanoseconds(0.25)  #: time allowed for an answer
-TRIES: Final = 6  #: number of times a request is sent
+TRIES: Final = 20  #: number of times a request is sent
+FEW_TRIES: Final = 4  #: the same for a request with a waiting caller, or unknown to old firmware
 WINDOW: Final = 4  #: number of requests under way at once: firmware keeps few packets
 TICK_NS: Final = nanoseconds(0.02)
-HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to be heard
+HELLO_NS: Final = nanoseconds(0.25)  #: time between two attempts to connect
 ALIVE_NS: Final = nanoseconds(0.5)  #: time between packets that keep a connection over UDP open
 DEGRADED_NS: Final = nanoseconds(0.5)
 LOST_NS: Final = nanoseconds(1.5)
@@ -101,7 +102,7 @@ class CrtpRequest:
 class Stage(Enum):
     """Progress of a connection."""
 
-    CALLING = auto()  #: nothing is heard
+    CALLING = auto()  #: no packet has arrived
     ASKING = auto()  #: versions and tables are being read
     LOGGING = auto()  #: log blocks are requested; their data follows
 
@@ -183,13 +184,14 @@ class CrazyflieSession(VehicleSession):
             self.due_ns = now_ns
         return applied
 
-    def ask(self, packet: CrtpPacket, prefix: bytes, done: Done, *, first: bool = False) -> None:
-        """Send a packet until it is answered; ``first``: before all other requests."""
-        request = CrtpRequest(packet, prefix, done)
-        if first:
-            self._queue.appendleft(request)
-        else:
-            self._queue.append(request)
+    def ask(self, packet: CrtpPacket, prefix: bytes, done: Done, tries: int = TRIES) -> None:
+        """Send a packet until it is answered."""
+        self._queue.append(CrtpRequest(packet, prefix, done, tries))
+        self.due_ns = 0
+
+    def _ask_first(self, packet: CrtpPacket, prefix: bytes, done: Done) -> None:
+        """Send a packet before all other requests, for as long as the caller waits for its answer."""
+        self._queue.appendleft(CrtpRequest(packet, prefix, done, FEW_TRIES))
         self.due_ns = 0
 
     def send_pose(self, pose: ExternalPose, now_ns: int) -> None:
@@ -204,12 +206,12 @@ class CrazyflieSession(VehicleSession):
         """Write a parameter; raises ``ValueError`` if the value doesn't fit its type."""
         entry = self.parameters.entries[number]
         packet = contents.write_parameter(number, entry.type.encode(value))
-        self.ask(packet, packet.data[:2], partial(self._on_written, done), first=True)
+        self._ask_first(packet, packet.data[:2], partial(self._on_written, done))
 
     def store(self, number: int, done: Done, *, clear: bool) -> None:
         """Keep a parameter's value in the vehicle's memory, or forget the kept one."""
         packet = MiscMessage(MiscCommand.CLEAR if clear else MiscCommand.STORE, number).encode()
-        self.ask(packet, packet.data[:3], done, first=True)
+        self._ask_first(packet, packet.data[:3], done)
 
     def _new_events(self) -> list[VehicleEvent]:
         return self.setpoints.pop_events()
@@ -315,11 +317,13 @@ class CrazyflieSession(VehicleSession):
         self.values.clear()
         self.due_ns = 0
         for query in VersionQuery:
-            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query))
+            self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), FEW_TRIES)
 
     def _on_version(self, query: VersionQuery, answer: CrtpPacket | None) -> None:
         if answer is not None:
             _, number, text = decode_version_answer(answer)
+        if self._abandoned:
+            return
         if query is VersionQuery.PROTOCOL:
             self.protocol = number if answer is not None else 0
             if not OLDEST_PROTOCOL <= self.protocol <= NEWEST_PROTOCOL:

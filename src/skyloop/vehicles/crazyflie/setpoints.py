@@ -1,7 +1,7 @@
 """Decide what to send for the newest action: flights of the high-level commander, or low-level set-points. Pure.
 
-The high-level commander runs in the vehicle and flies on when nobody is left to command it: it finishes a take-off, a
-landing or a flight to a place, and hovers. Low-level set-points are followed at once, but without the next one the
+The high-level commander runs in the vehicle and continues without a client: it finishes a take-off, a landing or a
+flight to a place, and hovers. Low-level set-points are followed at once, but without the next one the
 vehicle levels after 0.5 s and **cuts its motors after 2 s, in the air**. Therefore all but attitudes goes through the
 high-level commander, velocities too: ten times a second a short flight from where its plan is now, which ends at rest.
 Without the next one, the vehicle comes to rest and hovers.
@@ -53,8 +53,8 @@ LOW_LEVEL_NS: Final = nanoseconds(0.03)  #: time between two low-level set-point
 HIGH_LEVEL_NS: Final = nanoseconds(0.1)  #: time between two short flights
 HURRY_NS: Final = nanoseconds(0.04)  #: shortest time between two of them, when the velocity changes
 LEG_S: Final = 0.6  #: duration of one short flight
-#: Length of a short flight at 1 m/s, in units of its duration. The vehicle's planner ends each flight at rest; begun
-#: anew every 0.1 s, flights of this length make it fly at 1 m/s on average.
+#: Length of a short flight at 1 m/s, in units of its duration. The vehicle's planner ends each flight at rest; when
+#: repeated every 0.1 s, flights of this length make it fly at 1 m/s on average.
 LEG_GAIN: Final = 0.6
 BRAKE_GAIN: Final = (
     0.4  #: the same for the last flight, which ends at rest; 0.5 would be the planner's own deceleration
@@ -72,7 +72,7 @@ RISES_NS: Final = nanoseconds(1.0)  #: time after the last take-off packet withi
 FRESH_NS: Final = nanoseconds(0.5)  #: age of the newest state within which a take-off is sent
 SILENT_NS: Final = nanoseconds(0.35)  #: silence after which low-level set-points give way to a hover
 ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
-LATE_S: Final = 3.0  #: a landing that takes so much longer than planned is sent again
+LATE_S: Final = 3.0  #: delay of a landing after which it is sent again
 NEAR_M: Final = 0.15
 SLOW_M_S: Final = 0.3
 RELAXES: Final = 3  #: how often to tell the vehicle that no more low-level set-points follow
@@ -108,7 +108,7 @@ class CrazyflieSetpoints:
         self.receiving = False  #: whether the vehicle's state is arriving
         self.stop = MotorStop(self._leave_alone)
         self.reset_wanted = False  #: whether the vehicle must be restarted to end a stop
-        self.left_alone = False  #: after a stop or a landing that was given up, until a new action
+        self.left_alone = False  #: after an abandoned stop or landing, until a new action
         self._mode = velocity
         self._decision = Decision.STAY
         self._decided_ns = 0
@@ -278,7 +278,7 @@ class CrazyflieSetpoints:
         self._flight = _Flight(HighLevelLand(0, self._ground_m, 0.0, True, duration_s))
 
     def _hold(self, now_ns: int, *, anew: bool = False) -> None:
-        """Come to rest and hover: at a place near the vehicle (``anew``), or where its plan leads."""
+        """Come to rest and hover: near the vehicle (``anew``), or at the end of its plan."""
         estimate = self.telemetry.estimate
         if anew or self._relaxes == RELAXES or self._moving is None:
             if estimate.position_m is None or estimate.yaw_rad is None:
@@ -439,7 +439,7 @@ class CrazyflieSetpoints:
         setpoint = self._setpoint
         if self.flies_by_setpoints:
             if self._state_ns is None or now_ns - self._state_ns > SILENT_NS:
-                self._setpoint = None  # nothing is heard: the vehicle must not depend on what we send
+                self._setpoint = None  # no state arrives: end the vehicle's need for our set-points
                 self._hold(now_ns)
                 return self._flown(now_ns)
             if now_ns - self._sent_ns < LOW_LEVEL_NS:

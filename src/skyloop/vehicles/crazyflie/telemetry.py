@@ -104,7 +104,7 @@ def _vector(values: Mapping[str, float], prefix: str, names: str, scale: float =
 
 
 class CrazyflieTelemetry:
-    """The newest values of all logged variables, and what follows from them."""
+    """The newest values of all logged variables, and the conclusions from them."""
 
     def __init__(self) -> None:
         self.values: dict[str, float] = {}
@@ -147,7 +147,7 @@ class CrazyflieTelemetry:
         return self.is_set(Supervisor.IS_ARMED, "sys.armed")
 
     def is_flying(self, now_ns: int) -> bool | None:
-        """Whether the vehicle flies; None if that can't be told."""
+        """Whether the vehicle flies; None if unknown."""
         reported = self.is_set(Supervisor.IS_FLYING, "sys.isFlying")
         if reported is not None:
             return reported
@@ -206,7 +206,7 @@ class CrazyflieTelemetry:
 
     @property
     def range_m(self) -> float | None:
-        """Distance to what is below, as the range finder sees it; None if it sees nothing or there is none."""
+        """Distance to the surface below, measured by the range finder; None without a measurement."""
         if not any(self.parameters.get(name) for name in RANGE_FINDERS):
             return None
         range_mm = self.values.get("range.zrange", math.inf)
@@ -214,13 +214,13 @@ class CrazyflieTelemetry:
 
     @property
     def altitude_m(self) -> float | None:
-        """Height above what is below, where a range finder sees it; otherwise above the origin."""
+        """Height above the surface below, if a range finder measures it; otherwise above the origin."""
         if self.range_m is not None or self.estimate.position_m is None:
             return self.range_m
         return self.estimate.position_m[2]
 
     def changes(self) -> list[VehicleEvent]:
-        """Return events for what the supervisor has begun to report since the last call."""
+        """Return events for faults that the supervisor has reported since the last call."""
         bits = int(self.values.get(_INFO, 0))
         new, self._health = bits & ~self._health, bits
         return [message(text, reason, Severity.ERROR) for bit, reason, text in _ALARMS if new & bit]

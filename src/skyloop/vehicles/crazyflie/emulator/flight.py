@@ -14,7 +14,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import clamped, turned, wrap_angle
 from skyloop.sim.host import Report
-from skyloop.sim.parameters import Limits
+from skyloop.sim.parameters import GRAVITY_M_S2, Limits
 from skyloop.sim.world import Vec3
 from skyloop.vehicles.crazyflie.emulator import trajectories
 from skyloop.vehicles.crazyflie.emulator.trajectories import Flight, Place, Sample
@@ -32,7 +32,12 @@ LIMITS: Final = Limits(
     tilt_rad=0.5, climb_m_s=2.0, yaw_rate_rad_s=5.0, altitude_m=20.0, speed_m_s=3.0, takeoff_altitude_m=0.3
 )
 _START_M: Final = 0.06  # desired height above the ground at which a standing vehicle starts
-_PLACE_GAIN_PER_S: Final = 1.0
+_PLACE_GAIN_PER_S: Final = 1.3
+_SPEED_GAIN_PER_S: Final = 3.0
+_DRIFT_GAIN_PER_S3: Final = 0.5  # acceleration against a steady wind, per distance and time
+_MOST_DRIFT_M_S2: Final = 1.5
+_TILT_RAD: Final = 0.4  # maximum tilt along a path
+_AHEAD_S: Final = 0.2  # how far ahead a path's velocity is taken, because attitude and climb lag behind
 _HEIGHT_GAIN_PER_S: Final = 1.5
 _YAW_GAIN_PER_S: Final = 2.5
 _TRAJECTORIES: Final = 10  # number of trajectories that can be defined
@@ -88,7 +93,8 @@ class CrazyflieFlight:
         self._lands = False
         self._ground_m = 0.0
         self._begun = False
-        self._time_s = 0.0
+        self._time_s = self._step_s = 0.0
+        self._drift = (0.0, 0.0)  # acceleration against a steady wind, in the frame [m/s²]
         self._tumbled = False
 
     # State -----------------------------------------------------------------------------------------------------------
@@ -284,7 +290,8 @@ class CrazyflieFlight:
 
     def update(self, report: Report) -> None:
         """Handle the vehicle's newest report, and fly. Called regularly."""
-        flight, self._time_s = self._flight, report.believed.time_s
+        flight, now_s = self._flight, report.believed.time_s
+        self._step_s, self._time_s = min(0.1, now_s - self._time_s), now_s
         flight.update(report)
         if not self._begun:
             self._begun = True
@@ -311,11 +318,13 @@ class CrazyflieFlight:
             else:
                 self._flight.land()
             return
-        self._track(self.target)
+        self._track(self.target, plan.sample(self._elapsed_s + _AHEAD_S))
 
     def _follow_setpoint(self) -> None:
         message, age_s = self._setpoint, self._time_s - self._setpoint_s
-        if message is None or isinstance(message, wire.StopSetpoint):
+        if age_s > LEVEL_S and self._flight.standing:
+            self._forget()  # on the ground, the high-level commander may fly again
+        if message is None or _stops(message):
             self._off()
         elif age_s > CUT_S and self._flight.airborne:
             self.lock()
@@ -380,20 +389,48 @@ class CrazyflieFlight:
         if self._started(starts):
             self._flight.lean(math.radians(roll_deg), math.radians(-pitch_deg), climb, turn)
 
-    def _track(self, wanted: Sample) -> None:
-        """Fly along a path: with its velocity, and towards its place."""
+    def _track(self, wanted: Sample, ahead: Sample | None = None) -> None:
+        """Fly along a path: by its acceleration, and towards its velocity and place.
+
+        ``ahead`` is the path :data:`_AHEAD_S` later; None: the path is a single place.
+        """
         self.target = wanted
-        if not self._started(self._rises(wanted.place[2])):
+        ahead = ahead or wanted
+        if not self._started(self._rises(ahead.place[2])) or not self._flight.airborne:
+            self._drift = (0.0, 0.0)
             return
         x, y, _, yaw = self.place
-        across = math.hypot(wanted.place[0] - x, wanted.place[1] - y)
-        most = self._parameter("posCtlPid.xVelMax") / max(1e-9, across)
-        gain = min(_PLACE_GAIN_PER_S, most)
-        vx = wanted.velocity[0] + gain * (wanted.place[0] - x)
-        vy = wanted.velocity[1] + gain * (wanted.place[1] - y)
-        vz = wanted.velocity[2] + self._climb(wanted.place[2])
+        ex, ey = wanted.place[0] - x, wanted.place[1] - y
+        share = min(1.0, self._parameter("posCtlPid.xVelMax") / max(1e-9, _PLACE_GAIN_PER_S * math.hypot(ex, ey)))
+        east, north, _ = self._flight.velocity
+        vx, vy = turned(east, north, -self.frame.yaw_rad)
+        step = _DRIFT_GAIN_PER_S3 * share * self._step_s
+        self._drift = (
+            clamped(self._drift[0] + step * ex, _MOST_DRIFT_M_S2),
+            clamped(self._drift[1] + step * ey, _MOST_DRIFT_M_S2),
+        )
+        accelerations = [
+            (later - now) / _AHEAD_S + drift + _SPEED_GAIN_PER_S * (now + _PLACE_GAIN_PER_S * share * error - speed)
+            for now, later, drift, error, speed in zip(
+                wanted.velocity[:2], ahead.velocity[:2], self._drift, (ex, ey), (vx, vy), strict=True
+            )
+        ]
+        forward, left = turned(accelerations[0], accelerations[1], -yaw)
         rate = wanted.velocity[3] + _YAW_GAIN_PER_S * wrap_angle(wanted.place[3] - yaw)
-        self._flight.move(*turned(vx, vy, self.frame.yaw_rad), vz, clamped(rate, LIMITS.yaw_rate_rad_s))
+        self._flight.lean(
+            clamped(math.atan(-left / GRAVITY_M_S2), _TILT_RAD),
+            clamped(math.atan(forward / GRAVITY_M_S2), _TILT_RAD),
+            ahead.velocity[2] + self._climb(wanted.place[2]),
+            clamped(rate, LIMITS.yaw_rate_rad_s),
+        )
+
+
+def _stops(message: wire.Message) -> bool:
+    """Return whether a set-point turns the motors off."""
+    least = 1000  # thrust below which the motors are off
+    return isinstance(message, wire.StopSetpoint) or (
+        isinstance(message, wire.RollPitchThrust) and message.thrust < least
+    )
 
 
 def yaw_of(quaternion: tuple[float, float, float, float]) -> float:

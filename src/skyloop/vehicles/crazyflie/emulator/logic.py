@@ -23,7 +23,7 @@ from skyloop.vehicles.emulation.flight import Vehicle
 PROTOCOL: Final = crtp.NEWEST_PROTOCOL
 FIRMWARE: Final = "2025.12 (emulated by skyloop)"
 DEVICE: Final = "CF21"
-BOOT_TEXT: Final = "SYS: ----------------------------\nSYS: Crazyflie 2.1 is up and running!\nSYS: Emulated by skyloop\nSYS: Free to fly\n"
+BOOT_TEXT: Final = "SYS: ----------------------------\nSYS: Crazyflie 2.1 is up and running!\nSYS: Free to fly\n"
 MAX_BLOCKS: Final = 16
 MAX_VARIABLES: Final = 128  #: in all log blocks together
 _TRAJECTORY_TYPE, _TESTER_TYPE = 0x12, 0x15
@@ -39,9 +39,9 @@ _NUMBERS: Final = {row.entry.full_name: row.entry.number for row in PARAMETER_RO
 
 @dataclass(slots=True)
 class Block:
-    """A log block; ``period_s`` is None while it is stopped."""
+    """A log block: names of variables, and as which types they are sent; ``period_s`` is None while it is stopped."""
 
-    entries: list[contents.Entry] = field(default_factory=list)
+    variables: list[tuple[str, contents.ValueType]] = field(default_factory=list)
     period_s: float | None = None
     due_s: float = 0.0
 
@@ -284,15 +284,14 @@ class CrazyflieLogic:
         return CrtpError.NONE
 
     def _append(self, block: Block, request: LogRequest) -> int:
-        found = [_LOG.get(number) for number, _ in request.variables]
-        entries = [entry for entry in found if entry is not None]
-        if len(entries) < len(found):
+        if any(number not in _LOG for number, _ in request.variables):
             return CrtpError.NO_ENTRY
-        if sum(entry.type.size for entry in (*block.entries, *entries)) > contents.MAX_LOGGED:
+        variables = [(_LOG[number].full_name, type_) for number, type_ in request.variables]
+        if sum(type_.size for _, type_ in (*block.variables, *variables)) > contents.MAX_LOGGED:
             return CrtpError.TOO_BIG
-        if sum(len(each.entries) for each in self._blocks.values()) + len(entries) > MAX_VARIABLES:
+        if sum(len(each.variables) for each in self._blocks.values()) + len(variables) > MAX_VARIABLES:
             return CrtpError.NO_MEMORY
-        block.entries += entries
+        block.variables += variables
         return CrtpError.NONE
 
     def _log_data(self, time_s: float) -> Iterator[CrtpPacket]:
@@ -304,19 +303,20 @@ class CrazyflieLogic:
         }
         if not due:
             return
-        shown = log_values(self._snapshot([entry for block in due.values() for entry in block.entries]))
+        ranging = any(name.startswith("range.") for block in due.values() for name, _ in block.variables)
+        shown = log_values(self._snapshot(ranging))
         for number, block in due.items():
             assert block.period_s is not None
             block.due_s = max(block.due_s + block.period_s, time_s)
-            data = b"".join(_limited(entry.type, shown.get(entry.full_name, 0.0)) for entry in block.entries)
+            data = b"".join(_limited(type_, shown.get(name, 0.0)) for name, type_ in block.variables)
             yield contents.log_data(number, round(1000 * (time_s - self._boot_s)), data)
 
-    def _snapshot(self, entries: list[contents.Entry]) -> Snapshot:
+    def _snapshot(self, ranging: bool) -> Snapshot:
         assert self._report is not None
         believed, truth, flight = self._report.believed, self._report.truth, self.flight
         x, y, z, yaw = flight.place
         quaternion = quaternion_from_euler(believed.roll_rad, believed.pitch_rad, yaw)
-        ranges = self._ranges() if any(entry.group == "range" for entry in entries) else {}
+        ranges = self._ranges() if ranging else {}
         target, velocity = flight.target.place, flight.target.velocity
         return Snapshot(
             believed=believed,

@@ -169,16 +169,18 @@ def _piece(axes: Sequence[Polynomial], duration_s: float) -> Flight:
 def compressed_pieces(memory: bytes, offset: int, count: int) -> list[Flight]:
     """Read pieces given by Bézier curves, whose first control points are the ends of the piece before.
 
-    Raises:
-        DecodeError: As :func:`polynomials`.
+    A duration of 0 ends them early: clients count the start as a piece. Raises :class:`DecodeError` if there is none,
+    or the memory is too short.
     """
-    found = []
+    found: list[Flight] = []
     try:
         at = offset + _START.size
         ends = list(_START.unpack_from(memory, offset))
         for _ in range(count):
             kinds, duration_ms = _HEAD.unpack_from(memory, at)
             at += _HEAD.size
+            if duration_ms == 0:
+                break
             curves = []
             for axis in range(4):
                 more = _POINTS[kinds >> 2 * axis & 3]
@@ -190,12 +192,12 @@ def compressed_pieces(memory: bytes, offset: int, count: int) -> list[Flight]:
             found.append(_curve(curves, duration_ms / 1000))
     except struct.error:
         raise DecodeError("the trajectory reaches beyond the memory") from None
+    if not found:
+        raise DecodeError("the trajectory has no pieces")
     return found
 
 
 def _curve(curves: Sequence[Sequence[float]], duration_s: float) -> Flight:
-    if duration_s <= 0:
-        raise DecodeError("a piece of the trajectory has no duration")
     slopes = [[(len(c) - 1) * (b - a) for a, b in pairwise(c)] or [0.0] for c in curves]
 
     def at(time_s: float) -> Sample:

@@ -1,0 +1,71 @@
+"""The driver passes the driver suite against the emulated firmware of a Crazyflie."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.suite import DriverSuite, Flight
+from skyloop.drivers.uri import parse_uri
+from skyloop.messages import EmergencyStop, FlightState, Hover, LinkState, ResetEmergency
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+
+
+class TestCrazyflie(DriverSuite):
+    uri = "crazyflie://udp:127.0.0.1"
+    connect_timeout_s = 20.0
+    feedback_timeout_s = 10.0
+    takeoff_timeout_s = 30.0
+    emergency_timeout_s = 10.0
+    lost_timeout_s = 10.0
+    motion_timeout_s = 12.0
+
+    @pytest.fixture(autouse=True)
+    def _vehicle(self, monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> Iterator[None]:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        world = SimHost(with_crazyflies(SimOptions(world="empty", seed=4, wind=0.0)))
+        self.firmware = CrazyflieFirmware(world, port=0)
+        with self.firmware:
+            yield
+
+    def new_driver(self) -> Driver:
+        return self.make(parse_uri(self.firmware.address))
+
+    def vehicle_disappears(self) -> None:
+        self.firmware.stop()
+
+    def vehicle_appears(self) -> None:
+        self.firmware.start()
+
+    def test_emergency_stop_and_reset(self) -> None:
+        """As in the suite, but a locked Crazyflie has to be switched off and on before the reset."""
+        with self.opened(watch=set()) as (driver, sink):
+            flight = Flight(self, driver, sink)
+            driver.apply(EmergencyStop())
+            flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
+            driver.apply(Hover())
+            time.sleep(0.2)
+            flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
+            self.firmware.stop()
+            assert sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
+            self.firmware.start()
+            assert sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
+            driver.apply(ResetEmergency())
+            flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
+
+
+class TestEspDrone(TestCrazyflie):
+    """The dialect of ESP-Drone and LiteWing: each packet ends with a checksum."""
+
+    @pytest.fixture(autouse=True)
+    def _vehicle(self, monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> Iterator[None]:
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        world = SimHost(with_crazyflies(SimOptions(world="empty", seed=4, wind=0.0)))
+        self.firmware = CrazyflieFirmware(world, port=0, checksum=True)
+        with self.firmware:
+            yield
