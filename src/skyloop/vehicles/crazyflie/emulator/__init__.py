@@ -29,6 +29,7 @@ from skyloop.sim.host import Report, SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.vehicles import CRAZYFLIE
+from skyloop.vehicles.crazyflie.emulator.deck import DeckSettings, EmulatedDeck
 from skyloop.vehicles.crazyflie.emulator.logic import PROTOCOL, CrazyflieLogic
 from skyloop.vehicles.crazyflie.wire.crtp import (
     HELLO,
@@ -38,6 +39,7 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
     with_checksum,
     without_checksum,
 )
+from skyloop.vehicles.crazyflie.wire.pictures import DeckState
 from skyloop.vehicles.emulation.emulator import (
     NO_FAULTS,
     Address,
@@ -81,6 +83,7 @@ class CrazyflieSettings:
     checksum: bool
     faults: Faults
     delay_s: float
+    deck: DeckSettings | None
 
 
 class RunningFirmware(RunningEmulator):
@@ -92,6 +95,7 @@ class RunningFirmware(RunningEmulator):
         super().__init__(host, drone, loop or "skyloop-crazyflie")
         self._settings = settings
         self._client: Address | None = None
+        self.deck: EmulatedDeck | None = None
         vehicle = host.simulation.parameters[drone]
         full_n = (
             vehicle.rotors.full_thrust_n if vehicle.rotors else vehicle.most_thrust * vehicle.mass_kg * GRAVITY_M_S2
@@ -113,11 +117,16 @@ class RunningFirmware(RunningEmulator):
                 delay_s=settings.delay_s,
             )
             self._open.append(self._udp)
+            if settings.deck is not None:
+                self.deck = EmulatedDeck(self._loop, settings.deck)
+                self._open.append(self.deck)
+                self._video = self.deck.video
+                self._video.start()
             simulation = host.simulation
             self._tick(Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns()))
             if self._own_loop:
                 self._loop.start()
-            host.attach(drone, self, self, [])
+            host.attach(drone, self, self, [] if self.deck is None else [self.deck.camera])
         except BaseException:
             self.stop()
             raise
@@ -155,6 +164,9 @@ class RunningFirmware(RunningEmulator):
         for packet in self.logic.update(report, talks=self._client is not None):
             if self._client is not None:
                 self._send(packet.encode(), self._client)
+        if self.deck is not None:
+            x, y, z, _ = self.logic.flight.place
+            self.deck.hear(DeckState(0, (x, y, z)), report.captured_ns)
 
     def _crashed(self, text: str) -> None:
         if not text.startswith("stopped"):  # by our own command
@@ -175,6 +187,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         checksum: Whether each packet ends with a checksum, as in ESP-Drone and LiteWing.
         faults: Faults injected into all datagrams in both directions.
         delay_s: Delay added to all datagrams in each direction.
+        deck: What its AI-deck sends, and where; None: no AI-deck.
         loop: Thread shared by a fleet; None for a separate thread.
 
     Raises:
@@ -192,18 +205,21 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         checksum: bool = False,
         faults: Faults = NO_FAULTS,
         delay_s: float = 0.0,
+        deck: DeckSettings | None = None,
         loop: Loop | None = None,
     ) -> None:
         if not OLDEST_PROTOCOL <= protocol <= NEWEST_PROTOCOL:
             raise UsageError(f"protocol must be from {OLDEST_PROTOCOL} to {NEWEST_PROTOCOL}, got {protocol!r}")
         super().__init__(host, drone)
-        self.settings = CrazyflieSettings(bind, port, protocol, checksum, faults, checked_delay(delay_s))
+        self.settings = CrazyflieSettings(bind, port, protocol, checksum, faults, checked_delay(delay_s), deck)
         self._stored: dict[int, float] = {}
         self._loop = loop
 
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._stored, self._loop)
         self.settings = replace(self.settings, port=running.port)  # keeps the port the same after a restart
+        if running.deck is not None and self.settings.deck is not None:
+            self.settings = replace(self.settings, deck=replace(self.settings.deck, port=running.deck.port))
         return running
 
     @property
@@ -219,8 +235,10 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     @property
     def address(self) -> str:
         """Address for a driver on this machine."""
-        dialect = "?dialect=esp" if self.settings.checksum else ""
-        return f"crazyflie://udp:{self.settings.bind}:{self.port}{dialect}"
+        deck = self.settings.deck
+        options = ["dialect=esp"] if self.settings.checksum else []
+        options += [] if deck is None else [f"deck={deck.bind}:{deck.port}"]
+        return f"crazyflie://udp:{self.settings.bind}:{self.port}{'?' if options else ''}{'&'.join(options)}"
 
     @property
     def description(self) -> str:
