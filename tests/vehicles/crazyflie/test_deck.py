@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import socket
+import sys
 import threading
 from collections.abc import Iterator
 from itertools import pairwise
@@ -17,7 +18,7 @@ from skyloop.clock import ManualClock, monotonic_ns
 from skyloop.drivers import live_video
 from skyloop.drivers.live_video import Coded
 from skyloop.drivers.uri import parse_uri
-from skyloop.errors import UnsupportedError, UsageError
+from skyloop.errors import MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import Encoding, EventKind, Severity
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
@@ -242,6 +243,14 @@ def test_a_jpeg_of_another_size_or_damaged_is_not_shown() -> None:
     assert decoder.damaged == 2
 
 
+def test_without_opencv_jpegs_and_colour_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(UnsupportedError, match="vision"):
+        decoded(Picture(324, 244, Format.JPEG, b"\xff\xd8", 1))
+    with pytest.raises(MissingExtraError), receiving(options(9, "&deck_colour=1")):
+        pass
+
+
 @pytest.mark.parametrize("picture", [Picture(4, 4, 9, bytes(16), 1), Picture(0, 0, 0, b"", 1, version=11)])
 def test_unknown_formats_and_versions_are_refused(picture: Picture) -> None:
     with pytest.raises(UnsupportedError):
@@ -314,11 +323,16 @@ def test_without_a_subscriber_nothing_is_decoded() -> None:
 
 
 @pytest.fixture
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+def eager(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the pauses before connecting again."""
+    monkeypatch.setattr(live_video, "RETRY_S", (0.01, 0.02, 0.04))
+
+
+@pytest.fixture
+def impatient(eager: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten all waiting, so that a stall costs a fraction of a second."""
     monkeypatch.setattr(module, "SILENT_S", 0.25)
     monkeypatch.setattr(module, "PICTURELESS_S", 0.6)
-    monkeypatch.setattr(live_video, "RETRY_S", (0.01, 0.02, 0.04))
 
 
 @pytest.mark.usefixtures("impatient")
@@ -354,7 +368,7 @@ def test_a_deck_that_stays_silent_is_reported_once_and_asked_again_and_again() -
         assert [event.data.get("reason") for event in sink.events] == ["deck_lost"]
 
 
-@pytest.mark.usefixtures("impatient")
+@pytest.mark.usefixtures("eager")
 def test_a_deck_that_is_switched_on_later_is_found() -> None:
     with socket.create_server(("127.0.0.1", 0)) as reserved:
         port = reserved.getsockname()[1]
@@ -362,7 +376,7 @@ def test_a_deck_that_is_switched_on_later_is_found() -> None:
         assert sink.wait(lambda: bool(sink.events), WITHIN_S)
         with ShownDeck(port=port):
             assert sink.wait(lambda: sink.frame_counts["front"] > 0, WITHIN_S)
-        assert video.telemetry()["deck.stalls"] == 0
+            assert video.telemetry()["deck.stalls"] == 0
     assert [event.data.get("reason") for event in sink.events][:2] == ["deck_unreachable", None]
     assert "deck_restart" not in sink.events[0].text
 

@@ -12,7 +12,7 @@ import socket
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -247,15 +247,14 @@ class DeckDecoder:
 def _from_jpeg(picture: Picture) -> NDArray[np.uint8] | None:
     """Return the grey image in a JPEG; None if it is damaged or has another size than announced."""
     try:
-        import cv2
-    except ImportError as error:
-        raise UnsupportedError(str(MissingExtraError("JPEG images from an AI-deck", "vision"))) from error
+        cv2 = opencv("JPEG images from an AI-deck")
+    except MissingExtraError as error:
+        raise UnsupportedError(str(error)) from error
     if image_size(picture.data) != (picture.width, picture.height) or why_not_decoded(picture.data):
         return None
-    try:
+    image = None
+    with suppress(cv2.error):
         image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        return None
     if image is None or image.shape != (picture.height, picture.width):
         return None
     return np.ascontiguousarray(image, np.uint8)
@@ -263,17 +262,17 @@ def _from_jpeg(picture: Picture) -> NDArray[np.uint8] | None:
 
 def _from_bayer(mosaic: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return the colours of a mosaic with red in its first pixel, as the deck's colour sensor has it."""
-    import cv2
-
+    cv2 = opencv("colour from an AI-deck")
     return np.ascontiguousarray(cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2BGR), np.uint8)
 
 
-def require_colour() -> None:
-    """Raise :class:`MissingExtraError` unless OpenCV, which converts mosaics to colour, is installed."""
+def opencv(purpose: str) -> Any:
+    """Import OpenCV; raise :class:`MissingExtraError`, naming the purpose, if it is not installed."""
     try:
-        import cv2  # noqa: F401
+        import cv2
     except ImportError as error:
-        raise MissingExtraError("deck_colour, colour from an AI-deck", "vision", cause=str(error)) from error
+        raise MissingExtraError(purpose, "vision", cause=str(error)) from error
+    return cv2
 
 
 # All together --------------------------------------------------------------------------------------------------------
@@ -299,7 +298,7 @@ class DeckVideo:
         """Start receiving. Returns at once. Raises :class:`MissingExtraError` if colour is wanted without OpenCV."""
         options = self.options
         if options.colour:
-            require_colour()
+            opencv("colour from an AI-deck")
         self._futile = self._stalls = self._restarts = 0
         self._state = None
 
