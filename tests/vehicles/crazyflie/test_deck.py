@@ -36,10 +36,11 @@ from skyloop.vehicles.crazyflie.deck import (
 )
 from skyloop.vehicles.crazyflie.emulator.deck import DeckFaults, DeckPacker, to_grey
 from skyloop.vehicles.crazyflie.wire.cpx import Counting, Packet, PacketParser, encode, restart_camera
-from skyloop.vehicles.crazyflie.wire.pictures import Format, Picture, newer_packets, older_packets
+from skyloop.vehicles.crazyflie.wire.pictures import Format, Picture, PictureAssembly, newer_packets, older_packets
 from tests.support.pages import rows, section
 from tests.vehicles.crazyflie.deck_rig import (
     WITHIN_S,
+    Pixels,
     ScriptedDeck,
     ShownDeck,
     SimulatedDeck,
@@ -212,7 +213,7 @@ def test_closing_with_unread_images_ends_the_connection_in_order() -> None:
 # Images --------------------------------------------------------------------------------------------------------------
 
 
-def decoded(picture: Picture, *, colour: bool = False) -> np.ndarray | None:  # type: ignore[type-arg]
+def decoded(picture: Picture, *, colour: bool = False) -> Pixels | None:
     got = DeckDecoder(colour=colour).decode(Coded(picture, True, 0, 0, 0), show=True)
     return None if got is None else got.pixels
 
@@ -222,7 +223,7 @@ def test_colour_comes_back_from_a_mosaic() -> None:
     shown = np.zeros((244, 324, 3), np.uint8)
     shown[:, :108], shown[:, 108:216], shown[:, 216:] = (200, 30, 10), (20, 180, 40), (15, 25, 220)
     parser = PacketParser()
-    assembly = module.PictureAssembly()
+    assembly = PictureAssembly()
     got = [assembly.feed(packet) for packet in parser.feed(on_wire(DeckPacker("bayer", 0).packets(shown, 0)))]
     picture = got[-1]
     assert picture is not None
@@ -442,7 +443,7 @@ def test_a_deck_whose_images_are_not_read_skips_whole_ones() -> None:
         while shown.deck.sent == 0 or shown.shown < 2 * shown.deck.sent:
             waiting.wait(0.01)
         sent = shown.deck.sent
-        parser, assembly, got = PacketParser(), module.PictureAssembly(), 0
+        parser, assembly, got = PacketParser(), PictureAssembly(), 0
         while got < sent:
             got += sum(assembly.feed(packet) is not None for packet in parser.feed(client.recv(1 << 16)))
         assert assembly.broken == 0

@@ -10,17 +10,22 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from skyloop.clock import nanoseconds
+from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import MissingExtraError
+from skyloop.sim.host import Report
 from skyloop.vehicles.crazyflie import radio
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 from skyloop.vehicles.crazyflie.options import RadioAddress
 from skyloop.vehicles.crazyflie.radio import SAFE_LINK, RadioVehicle, lease
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket
+from tests.vehicles.crazyflie.rig import Rig
 
 ONE = RadioAddress(0, 80, "2M", b"\xe7\xe7\xe7\xe7\x01")
 TWO = RadioAddress(0, 90, "1M", b"\xe7\xe7\xe7\xe7\x02")
@@ -34,13 +39,14 @@ class Peer:
         self.received: list[CrtpPacket] = []
         self.answers: deque[bytes] = deque()
         self._up = self._down = 0
+        self._sent = False  # whether the first answer was sent
 
     def on_packet(self, packet: bytes) -> bytes:
         if packet == SAFE_LINK and self.can_be_safe:
             self.safe, self._up, self._down = True, 0, 0
             return SAFE_LINK
         if self.safe:
-            if packet[0] >> 2 & 1 != self._down and self.answers:  # the last answer has arrived
+            if packet[0] >> 2 & 1 != self._down and self._sent:  # the last answer has arrived
                 self.answers.popleft()
             self._down = packet[0] >> 2 & 1
             fresh, self._up = packet[0] >> 3 & 1 == self._up, self._up ^ (packet[0] >> 3 & 1 == self._up)
@@ -51,6 +57,7 @@ class Peer:
             self.received.append(CrtpPacket(decoded.port, decoded.channel, decoded.data))
         if not self.safe:
             return self.answers.popleft() if self.answers else b""
+        self._sent = bool(self.answers)
         head = self.answers[0] if self.answers else b"\xf3"
         return bytes((head[0] & 0xF3 | self._down << 2,)) + head[1:]
 
@@ -216,11 +223,51 @@ def test_an_unplugged_radio_is_opened_again() -> None:
     assert whole.closed
 
 
+class EmulatedPeer(Peer):
+    """An emulated Crazyflie behind a radio. It stands on the ground, and only its time passes."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self._rig = Rig(folder)
+
+    def on_packet(self, packet: bytes) -> bytes:
+        rig, before = self._rig, len(self.received)
+        answer = super().on_packet(packet)
+        for received in self.received[before:]:
+            self.answers.extend(each.encode() for each in rig.logic.receive(received))
+        if len(self.answers) < 10:
+            report = rig._report()
+            believed = replace(report.believed, time_s=time.monotonic())
+            report = Report(believed, report.truth, (), time.monotonic_ns())
+            self.answers.extend(each.encode() for each in rig.logic.update(report))
+        return answer
+
+
+def test_drivers_share_a_radio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    dongle = FakeDongle({ONE: EmulatedPeer(tmp_path), TWO: EmulatedPeer(tmp_path)}, lost=0.05)
+    monkeypatch.setattr(radio, "UsbDongle", lambda number: dongle)
+    monkeypatch.setattr("skyloop.vehicles.crazyflie.driver.require_usb", lambda: None)
+    drivers, sinks = [], []
+    for address in ("0/80/2M/E7E7E7E701", "0/90/1M/E7E7E7E702"):
+        drivers.append(CrazyflieDriver(parse_uri(f"crazyflie://radio:{address}")))
+        sinks.append(RecordingSink())
+        drivers[-1].open(sinks[-1])
+    try:
+        for sink in sinks:
+            assert sink.wait(lambda sink=sink: sink.feedback_count > 20, 60.0), sink.links
+            assert sink.newest is not None
+            assert sink.newest.position_m is not None
+            assert not sink.problems
+    finally:
+        for driver in drivers:
+            driver.close()
+    assert dongle.closed
+
+
 def test_without_pyusb_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "usb", None)
     monkeypatch.setitem(sys.modules, "usb.core", None)
     driver = CrazyflieDriver(parse_uri("crazyflie://radio:0/80/2M/E7E7E7E7E7"))
-    from skyloop.drivers.recording_sink import RecordingSink
-
     with pytest.raises(MissingExtraError, match="skyloop install crazyflie"):
         driver.open(RecordingSink())

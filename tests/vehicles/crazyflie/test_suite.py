@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 
 from skyloop.drivers.base import Driver
-from skyloop.drivers.suite import DriverSuite, Flight
+from skyloop.drivers.suite import DriverSuite, Flight, RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.messages import EmergencyStop, FlightState, Hover, LinkState, ResetEmergency
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
+from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 
 
 class TestCrazyflie(DriverSuite):
@@ -26,7 +28,7 @@ class TestCrazyflie(DriverSuite):
     motion_timeout_s = 12.0
 
     @pytest.fixture(autouse=True)
-    def _vehicle(self, monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> Iterator[None]:
+    def _vehicle(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
         world = SimHost(with_crazyflies(SimOptions(world="empty", seed=4, wind=0.0)))
         self.firmware = CrazyflieFirmware(world, port=0)
@@ -59,13 +61,17 @@ class TestCrazyflie(DriverSuite):
             flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
 
 
-class TestEspDrone(TestCrazyflie):
-    """The dialect of ESP-Drone and LiteWing: each packet ends with a checksum."""
-
-    @pytest.fixture(autouse=True)
-    def _vehicle(self, monkeypatch: pytest.MonkeyPatch, tmp_path: object) -> Iterator[None]:
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        world = SimHost(with_crazyflies(SimOptions(world="empty", seed=4, wind=0.0)))
-        self.firmware = CrazyflieFirmware(world, port=0, checksum=True)
-        with self.firmware:
-            yield
+def test_esp_drones_dialect(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """ESP-Drone and LiteWing end each packet with a checksum."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    world = SimHost(with_crazyflies(SimOptions(world="empty", seed=4, wind=0.0)))
+    sink = RecordingSink()
+    with CrazyflieFirmware(world, port=0, checksum=True) as firmware:
+        driver = CrazyflieDriver(parse_uri(firmware.address))
+        assert driver.options.checksum
+        driver.open(sink)
+        try:
+            assert sink.wait(lambda: sink.feedback_count > 5, 30.0), sink.links
+        finally:
+            driver.close()
+    assert not sink.problems

@@ -75,10 +75,14 @@ ALIVE_NS: Final = nanoseconds(0.5)  #: time between packets that keep a connecti
 DEGRADED_NS: Final = nanoseconds(0.5)
 LOST_NS: Final = nanoseconds(1.5)
 FIRST_DATA_NS: Final = nanoseconds(2.0)
+CLOCK_WINDOW_S: Final = 1.0  #: window of the estimate of the vehicle's clock, which is slow in a starved simulation
 STAMPS: Final = 1 << 24  #: log time stamps [ms] begin again there
 MAX_CONSOLE: Final = 400  #: longest line kept from the console [characters]
 POWER_OFF, POWER_ON = b"\xfe\x02", b"\xfe\x03"  #: in a null packet: switch the vehicle's main processor
 RESTART_NS: Final = nanoseconds(0.3)  #: how long it stays off
+
+#: Parameter of older firmware that switches the high-level commander on.
+HIGH_LEVEL: Final = "commander.enHighLevel"
 
 #: Called with the answer, or None if there was none.
 Done = Callable[[CrtpPacket | None], None]
@@ -153,13 +157,14 @@ class CrazyflieSession(VehicleSession):
         self._queue: deque[CrtpRequest] = deque()
         self._under_way: list[CrtpRequest] = []
         self._abandoned = False  # whether requests are ended rather than unanswered
+        self._enabled = False  # whether the high-level commander was switched on
         self._first: list[int] = []  # numbers of the parameters to read at once
         self._rest: list[int] = []  # numbers of the others
         self._blocks: dict[int, list[Entry]] = {}
         self._main = 0  # the block whose data completes a state
         self._urgent: deque[bytes] = deque()  # packets to be sent at the next poll, without an answer
         self._watch = RestartWatch(wrap=STAMPS)
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps, self._stamp = 0, 0
         self._called_ns = now_ns - HELLO_NS
         self._alive_ns = now_ns
@@ -315,6 +320,7 @@ class CrazyflieSession(VehicleSession):
         self._unreachable = ""
         self._log, self.parameters = Table(CrtpPort.LOG), Table(CrtpPort.PARAMETERS)
         self.values.clear()
+        self._enabled = False
         self.due_ns = 0
         for query in VersionQuery:
             self.ask(ask_version(query), bytes((query,)), partial(self._on_version, query), FEW_TRIES)
@@ -368,7 +374,7 @@ class CrazyflieSession(VehicleSession):
 
     def _on_complete(self, table: Table) -> None:
         if table is self.parameters:
-            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR}
+            wanted = {*DECKS, *RANGE_FINDERS, ESTIMATOR, HIGH_LEVEL}
             ordered = sorted(table.entries.values(), key=lambda entry: entry.full_name not in wanted)
             self._first = [entry.number for entry in ordered if entry.full_name in wanted]
             self._rest = [entry.number for entry in ordered if entry.full_name not in wanted]
@@ -402,6 +408,9 @@ class CrazyflieSession(VehicleSession):
         value = self.values[number] = entry.type.decode(data[: entry.type.size])
         if entry.full_name in (*DECKS, *RANGE_FINDERS, ESTIMATOR):
             self.telemetry.parameters[entry.full_name] = value
+        elif entry.full_name == HIGH_LEVEL and not value and not self._enabled:
+            self._enabled = True
+            self.write(number, 1, _ignore)
 
     def _on_reset(self, answer: CrtpPacket | None) -> None:
         main, slow = choose_variables(list(self._log.entries.values()))
@@ -517,7 +526,7 @@ class CrazyflieSession(VehicleSession):
         self._abandon()
         self._blocks.clear()
         self._watch.forget()
-        self._live = LiveClock()
+        self._live = LiveClock(CLOCK_WINDOW_S)
         self._wraps = self._stamp = 0
         self.setpoints.lost(now_ns)
         self.telemetry.forget()
@@ -535,3 +544,7 @@ class CrazyflieSession(VehicleSession):
                 "switch the vehicle on; check channel, rate and address, and that no other program uses the Crazyradio"
             )
         return "switch the vehicle on and join its Wi-Fi network; or correct the host in the address"
+
+
+def _ignore(_: CrtpPacket | None) -> None:
+    """Ignore an answer, because the parameter's value shows it."""

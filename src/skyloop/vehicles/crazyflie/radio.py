@@ -253,15 +253,18 @@ class RadioLease:
                 del _radios[self.radio.number]
 
 
-def lease(address: RadioAddress, open_dongle: Callable[[int], Dongle] = UsbDongle) -> RadioLease:
-    """Open a radio, or share an open one. Raises ``OSError`` if it can't be used, or its channel is another's."""
+def lease(address: RadioAddress, open_dongle: Callable[[int], Dongle] | None = None) -> RadioLease:
+    """Open a radio, or share an open one. Raises ``OSError`` if it can't be used.
+
+    ``open_dongle`` opens the Crazyradio of a number; by default, through USB.
+    """
     ours, theirs = _pair()
     vehicle = RadioVehicle(address, theirs)
     try:
         with _lock:
             radio = _radios.get(address.dongle)
             if radio is None or radio.error is not None:
-                radio = _radios[address.dongle] = Radio(address.dongle, open_dongle(address.dongle))
+                radio = _radios[address.dongle] = Radio(address.dongle, (open_dongle or UsbDongle)(address.dongle))
             radio.add(vehicle)
     except OSError:
         ours.close()

@@ -52,10 +52,12 @@ from skyloop.vehicles.crazyflie.wire.commander import (
 LOW_LEVEL_NS: Final = nanoseconds(0.03)  #: time between two low-level set-points
 HIGH_LEVEL_NS: Final = nanoseconds(0.1)  #: time between two short flights
 HURRY_NS: Final = nanoseconds(0.04)  #: shortest time between two of them, when the velocity changes
-LEG_S: Final = 0.6  #: duration of one short flight
+LEG_S: Final = 0.5  #: duration of one short flight
 #: Length of a short flight at 1 m/s, in units of its duration. The vehicle's planner ends each flight at rest; when
-#: repeated every 0.1 s, flights of this length make it fly at 1 m/s on average.
-LEG_GAIN: Final = 0.6
+#: repeated every 0.1 s, flights of this length make it fly at 1 m/s. A change of velocity is spread over this time
+#: constant, so that the plan reaches 90 % of it in 0.3 s without overshooting.
+LEG_GAIN: Final = 0.61
+EASE_S: Final = 0.144
 BRAKE_GAIN: Final = (
     0.4  #: the same for the last flight, which ends at rest; 0.5 would be the planner's own deceleration
 )
@@ -72,7 +74,7 @@ RISES_NS: Final = nanoseconds(1.0)  #: time after the last take-off packet withi
 FRESH_NS: Final = nanoseconds(0.5)  #: age of the newest state within which a take-off is sent
 SILENT_NS: Final = nanoseconds(0.35)  #: silence after which low-level set-points give way to a hover
 ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
-LATE_S: Final = 3.0  #: delay of a landing after which it is sent again
+LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-off counts as finished
 NEAR_M: Final = 0.15
 SLOW_M_S: Final = 0.3
 RELAXES: Final = 3  #: how often to tell the vehicle that no more low-level set-points follow
@@ -120,10 +122,11 @@ class CrazyflieSetpoints:
         self._state_ns: int | None = None
         self._sent_ns = 0  # when the last set-point or short flight was sent
         self._moving: Velocity | None = Velocity()  # of the last short flight; None: another flight is under way
+        self._wanted = Velocity()  # the velocity that short flights approach
         self._planned: Vector | None = None  # where short flights should have brought it
         self._height_m: float | None = None  # height that low-level set-points hold
         self._ground_m = 0.0  # height of the ground, as far as known
-        self._target_m = 0.0  # height at the end of a take-off
+        self._target_m = self._takeoff_s = 0.0  # height at the end of a take-off, and its duration
         self._place: Position | None = None  # the place of the last flight, as requested
         self._heading_rad: float | None = None  # heading to keep on flights to places
         self._rises_until_ns = 0
@@ -252,19 +255,21 @@ class CrazyflieSetpoints:
             self._planned = self._height_m = self._place = self._heading_rad = None
             if self._setpoint is not None:
                 self._moving = None
+        if setpoint is not None and setpoint != self._setpoint:
+            self._flight = None
         self._setpoint = setpoint
 
     def _decide(self, decision: Decision, now_ns: int) -> None:
         if decision is self._decision:
             return
         self._decision, self._decided_ns, self._flight = decision, now_ns, None
-        self._setpoint, self._moving, self._armed_ns, self._place = None, Velocity(), None, None
+        self._setpoint = self._moving = self._armed_ns = self._place = None
         position = self.telemetry.estimate.position_m
         if decision is Decision.TAKE_OFF and position is not None:
             self._ground_m = position[2]
             self._target_m = self._ground_m + self.limits[TAKEOFF_ALTITUDE]
-            duration_s = max(1.0, self.limits[TAKEOFF_ALTITUDE] / CLIMB_M_S)
-            self._flight = _Flight(HighLevelTakeoff(0, self._target_m, 0.0, True, duration_s))
+            self._takeoff_s = max(1.0, self.limits[TAKEOFF_ALTITUDE] / CLIMB_M_S)
+            self._flight = _Flight(HighLevelTakeoff(0, self._target_m, 0.0, True, self._takeoff_s))
         elif decision is Decision.LAND:
             self._land(now_ns)
 
@@ -331,7 +336,8 @@ class CrazyflieSetpoints:
         if self._decision is Decision.TAKE_OFF:
             if flying and estimate.position_m is not None:
                 up = estimate.position_m[2] >= self._target_m - NEAR_M
-                if up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S:
+                settled = up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S
+                if settled or now_ns - self._decided_ns > nanoseconds(self._takeoff_s + LATE_S):
                     self._decide(Decision.STAY, now_ns)
             elif rose and not flying:
                 self._give_up("the vehicle began to take off, and its motors stopped: it is not started again", now_ns)
@@ -368,7 +374,7 @@ class CrazyflieSetpoints:
         self.receiving, self._state_ns = False, None
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
-        self._setpoint, self._moving = None, Velocity()
+        self._setpoint, self._moving, self._relaxes = None, None, RELAXES
         if self._decision is not Decision.LAND:
             self._flight = None
 
@@ -467,12 +473,13 @@ class CrazyflieSetpoints:
         return ZDistanceSetpoint(math.degrees(setpoint.roll), -math.degrees(setpoint.pitch), turn, self._height_m)
 
     def _short_flights(self, velocity: Velocity, now_ns: int) -> list[Message]:
-        changed = velocity != self._moving
+        changed = velocity != self._wanted or self._moving is None
         if now_ns - self._sent_ns < (HURRY_NS if changed else HIGH_LEVEL_NS):
             return []
         if velocity == Velocity():
-            if changed or self._relaxes == RELAXES:
+            if self._moving != Velocity() or self._relaxes == RELAXES:
                 self._hold(now_ns)
+            self._wanted = velocity
             return self._flown(now_ns)
         estimate = self.telemetry.estimate
         if estimate.position_m is None or estimate.yaw_rad is None:
@@ -482,8 +489,9 @@ class CrazyflieSetpoints:
         vx, vy = turned(moving.forward, moving.left, estimate.yaw_rad)
         x, y, z = self._planned or estimate.position_m
         self._planned = x + vx * since_s, y + vy * since_s, z + moving.up * since_s
-        self._moving, self._sent_ns, self._flight = velocity, now_ns, None
-        leg = self._leg(velocity, LEG_GAIN)
+        eased = _eased(moving, velocity, since_s)
+        self._moving, self._wanted, self._sent_ns, self._flight = eased, velocity, now_ns, None
+        leg = self._leg(eased, LEG_GAIN)
         speed = math.hypot(velocity.forward, velocity.left, velocity.up)
         if self._relaxes == RELAXES or math.dist(self._planned, estimate.position_m) > AHEAD_M + LEG_S * speed:
             # The plan is elsewhere: start from where the vehicle is.
@@ -524,3 +532,15 @@ class CrazyflieSetpoints:
             return None
         running = self.telemetry.motors_run
         return not self.telemetry.is_flying(now_ns) if running is None else not running
+
+
+def _eased(now: Velocity, wanted: Velocity, since_s: float) -> Velocity:
+    """Return the velocity on the way from one to another after a time."""
+    part = 1.0 - math.exp(-since_s / EASE_S)
+    pairs = (
+        (now.forward, wanted.forward),
+        (now.left, wanted.left),
+        (now.up, wanted.up),
+        (now.yaw_rate, wanted.yaw_rate),
+    )
+    return Velocity(*(goal if abs(goal - at) < 0.01 else at + part * (goal - at) for at, goal in pairs))

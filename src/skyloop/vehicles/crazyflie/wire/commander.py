@@ -491,7 +491,7 @@ _MESSAGES: Final[tuple[type[Message], ...]] = (
     Arm,
     Recover,
 )
-_BY_NUMBER: Final = {
+_BY_NUMBER: Final[dict[tuple[int, int, int | None], tuple[type[Message], Layout]]] = {
     (layout.port, layout.channel, layout.number): (kind, layout) for kind in _MESSAGES for layout in kind.LAYOUTS
 }
 
@@ -503,12 +503,13 @@ def decode_message(packet: CrtpPacket) -> Message | None:
     """
     key = packet.port, packet.channel
     data = packet.data
-    kind, layout = _BY_NUMBER.get((*key, None), (None, None))  # type: ignore[arg-type]
-    if layout is None and data:
-        kind, layout = _BY_NUMBER.get((*key, data[0]), (None, None))  # type: ignore[arg-type]
+    known = _BY_NUMBER.get((*key, None))
+    if known is None and data:
+        known = _BY_NUMBER.get((*key, data[0]))
         data = data[1:]
-    if kind is None or layout is None:
+    if known is None:
         return None
+    kind, layout = known
     try:
         values = iter(struct.unpack("<" + layout.form, data))
     except struct.error:
