@@ -236,9 +236,9 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     def address(self) -> str:
         """Address for a driver on this machine."""
         deck = self.settings.deck
-        options = ["dialect=esp"] if self.settings.checksum else []
-        options += [] if deck is None else [f"deck={deck.bind}:{deck.port}"]
-        return f"crazyflie://udp:{self.settings.bind}:{self.port}{'?' if options else ''}{'&'.join(options)}"
+        kind = "esp" if self.settings.checksum else "udp"
+        more = "" if deck is None else f"?deck={deck.bind}:{deck.port}"
+        return f"crazyflie://{kind}:{self.settings.bind}:{self.port}{more}"
 
     @property
     def description(self) -> str:

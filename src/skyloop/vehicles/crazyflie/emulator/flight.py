@@ -137,16 +137,18 @@ class CrazyflieFlight:
         """Arm or disarm, which stops the motors even in the air; return whether it was done."""
         if wanted and (self._locked or self._crashed or self._tumbled):
             return False
-        self._armed = wanted
-        if not wanted:
-            self._forget()
+        if wanted is not self._armed:
+            self._armed = wanted
+            self._forget()  # what was asked for before must not start the motors
         return True
 
     def recover(self) -> bool:
         """Leave the state "crashed" while the vehicle stands; return whether it was done."""
         if self._tumbled or not self._flight.standing:
             return False
-        self._crashed = False
+        if self._crashed:
+            self._crashed = False
+            self._forget()  # what was asked for before must not start the motors
         return True
 
     def crash(self) -> None:
