@@ -11,6 +11,7 @@ from skyloop.drivers.vehicle_session import deliver
 from skyloop.errors import DriverError, ParameterError, UsageError
 from skyloop.messages import AnyAction, Capabilities, Hover, Land, Parameter, Refusal, Value
 from skyloop.messages.parameter import Diagnostic
+from skyloop.vehicles.crazyflie.deck import DECK_OPTIONS, DeckVideo, deck_options
 from skyloop.vehicles.crazyflie.link import CrazyflieLink
 from skyloop.vehicles.crazyflie.options import LinkKind, options_of
 from skyloop.vehicles.crazyflie.parameters import CrazyflieParameters
@@ -27,16 +28,22 @@ class CrazyflieDriver(Driver):
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
-        self.options = options_of(uri)
+        self.options = options_of(uri, DECK_OPTIONS)
+        deck = deck_options(uri)
+        self._deck = None if deck is None else DeckVideo(deck)
         self._link: CrazyflieLink | None = None
         self._parameters: CrazyflieParameters | None = None
 
     def capabilities(self) -> Capabilities:
         """Return the vehicle's capabilities. A vehicle without a position refuses all flights but attitudes."""
-        return Capabilities(vehicle="crazyflie", actions=ACTIONS, description=f"a Crazyflie at {self.options}")
+        cameras = () if self._deck is None else (self._deck.options.camera,)
+        return Capabilities(
+            vehicle="crazyflie", actions=ACTIONS, cameras=cameras, description=f"a Crazyflie at {self.options}"
+        )
 
     def _open(self, sink: Sink) -> None:
-        session = CrazyflieSession(self.options, monotonic_ns())
+        deck = self._deck
+        session = CrazyflieSession(self.options, monotonic_ns(), extra=dict if deck is None else deck.telemetry)
         if self.options.kind is LinkKind.TCP:
             raise UsageError(f"{self.uri}: flying over TCP is not supported yet")
         if self.options.kind is LinkKind.RADIO:
@@ -44,10 +51,14 @@ class CrazyflieDriver(Driver):
         link = CrazyflieLink(session, lambda pending: deliver(sink, pending), serve=self.serve_link)
         self._link, self._parameters = link, CrazyflieParameters(link)
         link.start()
+        if deck is not None:
+            deck.open(sink)
 
     def _close(self) -> None:
         if self._link is not None:
             self._link.stop()
+        if self._deck is not None:
+            self._deck.close()
         self._link = self._parameters = None
 
     def _apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:

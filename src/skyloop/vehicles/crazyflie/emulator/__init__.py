@@ -39,6 +39,7 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
     with_checksum,
     without_checksum,
 )
+from skyloop.vehicles.crazyflie.wire.pictures import DeckState
 from skyloop.vehicles.emulation.emulator import (
     NO_FAULTS,
     Address,
@@ -95,6 +96,7 @@ class RunningFirmware(RunningEmulator):
         super().__init__(host, drone, loop or "skyloop-crazyflie")
         self._settings = settings
         self._client: Address | None = None
+        self.deck: EmulatedDeck | None = None
         vehicle = host.simulation.parameters[drone]
         full_n = (
             vehicle.rotors.full_thrust_n if vehicle.rotors else vehicle.most_thrust * vehicle.mass_kg * GRAVITY_M_S2
@@ -223,6 +225,8 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     def _switched_on(self) -> RunningFirmware:
         running = RunningFirmware(self.host, self.drone, self.settings, self._stored, self._loop)
         self.settings = replace(self.settings, port=running.port)  # keeps the port the same after a restart
+        if running.deck is not None and self.settings.deck is not None:
+            self.settings = replace(self.settings, deck=replace(self.settings.deck, port=running.deck.port))
         return running
 
     @property
@@ -243,7 +247,10 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
     @property
     def address(self) -> str:
         """Address for a driver on this machine."""
-        return f"crazyflie://{'esp' if self.settings.checksum else 'udp'}:{self.settings.bind}:{self.port}"
+        deck = self.settings.deck
+        kind = "esp" if self.settings.checksum else "udp"
+        more = "" if deck is None else f"?deck={deck.bind}:{deck.port}"
+        return f"crazyflie://{kind}:{self.settings.bind}:{self.port}{more}"
 
     @property
     def description(self) -> str:
