@@ -125,9 +125,8 @@ def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
     corners = project(rectangle(SIZE_M, SIZE_M) @ rotation.T + place, lens)
     image = np.full((_HEIGHT, _WIDTH), 0.5 * (case.white + case.black))
     reach = 0.7 * np.ptp(corners, axis=0).max() + 4 * case.blur_px + case.motion_px / 2 + 4
-    middle = corners.mean(axis=0)
-    low = np.maximum(0, np.floor(middle - reach)).astype(int)
-    high = np.minimum((_WIDTH, _HEIGHT), np.ceil(middle + reach)).astype(int)
+    low = np.maximum(0, np.floor(corners.mean(axis=0) - reach)).astype(int)
+    high = np.minimum((_WIDTH, _HEIGHT), np.ceil(corners.mean(axis=0) + reach)).astype(int)
     drawn = _traced(case, number, lens, (rotation, place), (low, high))
     drawn = cv2.GaussianBlur(drawn, (0, 0), case.blur_px * _FINER)
     if case.motion_px:
@@ -137,7 +136,7 @@ def show(case: Case, number: int, rng: np.random.Generator) -> Shown:
     return Shown(_noisy(image, case.noise, rng), lens, corners, float(np.linalg.norm(place)))
 
 
-def _traced(case: Case, number: int, lens: Intrinsics, pose: tuple[Array, Array], area: tuple[Any, Any]) -> Any:
+def _traced(case: Case, number: int, lens: Intrinsics, pose: tuple[Any, Any], area: tuple[Any, Any]) -> Any:
     """Return the brightness along the rays of an area."""
     (left, top), (right, bottom) = area
     across = (np.arange((right - left) * _FINER) + 0.5) / _FINER - 0.5 + left
@@ -180,13 +179,14 @@ def empty_images() -> Iterator[tuple[str, Image]]:
     yield "texture", _noisy(120.0 + rough + cv2.resize(rng.normal(0, 12, (360, 640)), shape[::-1]), 2.0, rng)
     boxes = np.full(shape, 120, np.uint8)
     for _ in range(150):
-        box = cv2.boxPoints((rng.uniform((0, 0), shape[::-1]), rng.uniform(8, 120, 2), rng.uniform(0, 180)))
+        centre, size = rng.uniform((0, 0), shape[::-1]).tolist(), rng.uniform(8, 120, 2).tolist()
+        box = cv2.boxPoints((centre, size, rng.uniform(0, 180)))
         cv2.fillConvexPoly(boxes, box.astype(np.int32), int(rng.integers(0, 255)), cv2.LINE_AA)
     yield "150 rectangles", _noisy(cv2.GaussianBlur(boxes, (0, 0), 0.7).astype(float), 2.0, rng)
     yield "noise 20", _noisy(np.full(shape, 120.0), 20.0, rng)
 
 
-def _noisy(image: Array, deviation: float, rng: np.random.Generator) -> Image:
+def _noisy(image: NDArray[Any], deviation: float, rng: np.random.Generator) -> Image:
     return np.asarray((image + rng.normal(0, deviation, image.shape)).round().clip(0, 255), np.uint8)
 
 

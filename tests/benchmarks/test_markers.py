@@ -26,8 +26,8 @@ def test_a_square_shows_the_convention_by_its_centre_of_brightness() -> None:
     """Independent of any detector: the darkness of the card's inner square is centred between the corners."""
     case = markers.Case("frontal", side_px=48.0, tilt_deg=0.0, noise=0.0)
     shown = markers.show(case, 7, np.random.default_rng(4))
-    inside = cv2.fillConvexPoly(np.zeros(shown.image.shape, np.uint8), shown.corners.round().astype(np.int32), 255)
-    inside = cv2.dilate(inside, np.ones((5, 5), np.uint8)) > 0
+    filled = cv2.fillConvexPoly(np.zeros(shown.image.shape, np.uint8), shown.corners.round().astype(np.int32), 255)
+    inside = np.asarray(cv2.dilate(filled, np.ones((5, 5), np.uint8)) > 0)
     outline = np.abs(shown.image.astype(float) - 210.0) > 90.0  # border and dark data
     y, x = np.nonzero(outline & inside)
     middle = np.array([x.min() + x.max(), y.min() + y.max()]) / 2

@@ -47,9 +47,9 @@ def degraded(
     """The image blurred, smeared sideways and with noise."""
     seen = image.astype(np.float64)
     if blur_px:
-        seen = cv2.GaussianBlur(seen, (0, 0), blur_px)
+        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), blur_px), np.float64)
     if motion_px:
-        seen = cv2.blur(seen, (motion_px, 1))
+        seen = np.asarray(cv2.blur(seen, (motion_px, 1)), np.float64)
     seen += np.random.default_rng(seed).normal(0.0, noise, seen.shape)
     return seen.round().clip(0, 255).astype(np.uint8)
 
@@ -113,7 +113,7 @@ def test_the_right_pose_is_chosen_by_motion() -> None:
         right, other = np.array([0.0, 0.0, -1.0]), np.array([np.sin(2 * aside), 0.0, -np.cos(2 * aside)])
         costs = rng.normal((6.0, 7.0), 1.5)
         alone.append(int(np.argmin(costs)))
-        together.append(choice.choose(costs, [right, other], 1_000_000_000 + n * 33_000_000))
+        together.append(choice.choose(costs.tolist(), [right, other], 1_000_000_000 + n * 33_000_000))
     assert sum(alone) > 10
     assert sum(together[5:]) == 0
     # After a second out of view, only the image counts.

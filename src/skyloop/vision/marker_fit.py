@@ -139,7 +139,8 @@ def line_quads(cv: Any, image: NDArray[Any], quads: Array, cells: int, *, close:
     slope = (total * along * place).sum(axis=-1) / (total * along**2).sum(axis=-1)
     begin, end = mean + slope * along[..., 0], mean + slope * along[..., -1]
     ends = (on[:, :, 0] + begin[..., None] * out, on[:, :, -1] + end[..., None] * out)
-    lines = np.cross(*(np.concatenate([each, np.ones_like(each[..., :1])], axis=-1) for each in ends))
+    first, last = (np.concatenate([each, np.ones_like(each[..., :1])], axis=-1) for each in ends)
+    lines = np.cross(first, last)
     meeting = np.cross(np.roll(lines, 1, axis=1), lines)
     parallel = np.abs(meeting[..., 2:]) < 1e-9
     corners = meeting[..., :2] / np.where(parallel, 1.0, meeting[..., 2:])
@@ -206,13 +207,13 @@ class _Template:
         smooth = _blurred(cv, self._drawn, blur * self._per_cell**2)
         du, dv = np.gradient(smooth, axis=1), np.gradient(smooth, axis=0)
         seconds = (np.gradient(du, axis=1) / 2, np.gradient(dv, axis=0) / 2, np.gradient(du, axis=0))
-        value, du, dv, *seconds = (each[self._used, self._used].ravel() for each in (smooth, du, dv, *seconds))
+        value, du, dv, *bends = (each[self._used, self._used].ravel() for each in (smooth, du, dv, *seconds))
         scale = self._per_cell * self._half
         du, dv, u, v = du * scale, dv * scale, self.u, self.v
         along = du * u + dv * v
         moving = [du * u, du * v, du, dv * u, dv * v, dv, -along * u, -along * v]
         # A blur spreads brightness as heat does: its derivatives are second derivatives.
-        return value, np.stack([*moving, *(each * self._per_cell**2 for each in seconds)], axis=1)
+        return value, np.stack([*moving, *(each * self._per_cell**2 for each in bends)], axis=1)
 
 
 def fit_pattern(

@@ -39,10 +39,11 @@ def solutions(cv: Any, outline_m: Array, rays: Array, covariance: Array) -> list
         covariance: Of the rays, (8, 8).
     """
     count, turns, places, _ = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=cv.SOLVEPNP_IPPE_SQUARE)
-    inverse = np.linalg.inv(covariance)
+    inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
     found = []
     for turn, place in zip(turns[:count], places[:count], strict=True):
-        position, rotation = np.asarray(place, dtype=np.float64).reshape(3), np.asarray(cv.Rodrigues(turn)[0])
+        position: Array = np.asarray(place, dtype=np.float64).reshape(3)
+        rotation: Array = np.asarray(cv.Rodrigues(turn)[0], dtype=np.float64)
         pose = _refined(cv, outline_m, rays, inverse, (position, rotation))
         if pose is not None:
             found.append(pose)
@@ -73,7 +74,7 @@ def _refined(cv: Any, outline_m: Array, rays: Array, inverse: Array, start: tupl
         if best is not None and cost >= best.cost:
             break
         try:
-            spread = np.linalg.inv(normal)
+            spread: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         except np.linalg.LinAlgError:
             break
         best = SquarePose(position, rotation, spread, float(np.sqrt((off**2).sum() / 4)), cost)

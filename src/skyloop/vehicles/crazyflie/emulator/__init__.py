@@ -39,7 +39,6 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
     with_checksum,
     without_checksum,
 )
-from skyloop.vehicles.crazyflie.wire.pictures import DeckState
 from skyloop.vehicles.emulation.emulator import (
     NO_FAULTS,
     Address,
