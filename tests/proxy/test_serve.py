@@ -21,6 +21,7 @@ from skyloop.proxy.serve import Shutdown, on_signals, run, serve
 from skyloop.transport.local import LocalServer, dial
 from tests.proxy.toy_process import Toy
 from tests.support.proxy_bench import WAIT_S, App
+from tests.support.systems import only_on
 
 pytestmark = [pytest.mark.process, pytest.mark.skipif(sys.platform != "linux", reason="the local transport is Linux's")]
 
@@ -84,18 +85,58 @@ def test_a_vehicle_in_flight_is_landed_if_another_cannot_be_started(
     apps[0].end.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_lands_first_and_has_a_reason(start: Start, number: signal.Signals) -> None:
+@pytest.fixture
+def in_terminal() -> Iterator[None]:
+    """Let this process and its children hear SIGHUP, which what runs the tests without a terminal may ignore."""
+    if not hasattr(signal, "SIGHUP"):
+        yield
+        return
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize(
+    "number", ["SIGTERM", "SIGINT", pytest.param("SIGHUP", marks=only_on("linux", "darwin", reason="no such signal"))]
+)
+@pytest.mark.usefixtures("in_terminal")
+def test_a_signal_lands_first_and_has_a_reason(start: Start, number: str) -> None:
     process = start()
     app = flying()
-    process.send_signal(number)
+    process.send_signal(getattr(signal, number))
     assert rest_of(process) == ["told takeoff", "told land", "closed", "served"]
     assert process.returncode == 0
     app.closed_by.get(timeout=WAIT_S)
     (closing,) = [event for event in app.events if event.kind is EventKind.PROXY_CLOSING]
-    assert number.name in closing.text
+    assert number in closing.text
     assert next(event for event in app.events if event.kind is EventKind.FAILSAFE).data["reason"] == "closing"
     app.end.close()
+
+
+@only_on("linux", "darwin", reason="no such signal")
+@pytest.mark.usefixtures("in_terminal")
+def test_a_closed_terminal_does_not_shorten_a_landing() -> None:
+    """It sends SIGHUP, so does its shell, and the end of a session SIGTERM; there, the second one ended the wait."""
+    shutdown = Shutdown()
+    with on_signals(shutdown, ignore_interrupt=False):
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGTERM, signal.SIGHUP):
+            signal.raise_signal(number)
+            assert shutdown.requested.is_set()
+            assert not shutdown.hurry.is_set()
+        signal.raise_signal(signal.SIGTERM)
+        assert shutdown.hurry.is_set()
+
+
+@only_on("linux", "darwin", reason="no such signal")
+def test_nohup_keeps_a_proxy_without_its_terminal() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    shutdown = Shutdown()
+    try:
+        with on_signals(shutdown, ignore_interrupt=False):
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert not shutdown.requested.is_set()
 
 
 def test_ctrl_break_is_a_signal_too(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1080,8 +1080,12 @@ def test_an_ending_server_leaves_the_memory_of_others_in_its_process() -> None:
         client = dial("bravo")(there)
         client.subscribe(video(FRONT))
         wait_until(lambda: bravo.subscribers(video(FRONT)), "it watches")
-        bravo.publish_frame(header(1), picture(header(1)))
-        wait_until(lambda: there.frames, "there is a frame")
+
+        def arrived() -> bool:
+            bravo.publish_frame(header(1), picture(header(1)))  # until one finds the client ready for it
+            return bool(there.frames)
+
+        wait_until(arrived, "there is a frame")
         before = named(named_memory.prefix())
         with serving("alpha"):
             pass

@@ -57,8 +57,8 @@ def serve(
     """Serve all vehicles of a fleet that start automatically. Blocks. Must run on the main thread.
 
     Like ``skyloop proxy``, this prints a line for each vehicle: ``failed NAME: …`` if it can't be served, and ``hosting
-    …`` after all have been tried. SIGINT or SIGTERM ends it. The host first lands all flying vehicles, for up to
-    ``land_within_s`` [s]. A second signal ends this wait. Members of ``group`` may also add and remove vehicles.
+    …`` after all have been tried. SIGINT, SIGTERM or SIGHUP ends it. The host first lands all flying vehicles, for up
+    to ``land_within_s`` [s]. A second signal ends this wait. Members of ``group`` may also add and remove vehicles.
     ``metrics``: ``[HOST:]PORT`` of an endpoint for Prometheus. The address is printed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)

@@ -79,11 +79,17 @@ class Shutdown:
         self.requested = threading.Event()
         self.hurry = threading.Event()  #: set if the process must end without landing first
         self.reason = ""
+        self._asked = False  # by a person or a program that may ask again
 
-    def request(self, reason: str, *, hurry: bool) -> None:
-        """Request that the process end. Thread-safe, even for signal handlers."""
-        if hurry or self.requested.is_set():  # a second signal ends the process immediately
+    def request(self, reason: str, *, hurry: bool, once: bool = False) -> None:
+        """Request that the process end. Thread-safe, even for signal handlers.
+
+        A second request ends the process immediately. ``once``: whether this one counts neither as the first nor as the
+        second, because nobody who sees the process made it.
+        """
+        if hurry or (self._asked and not once):
             self.hurry.set()
+        self._asked |= not once
         self.reason = self.reason or reason
         self.requested.set()
 
@@ -106,10 +112,11 @@ def serve(
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
     Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
-    with ``parent_fd``). Ends on SIGINT or SIGTERM, after landing a flying vehicle within at most ``land_within_s`` [s].
-    A second signal ends the wait. With ``parent_fd``, the reading end of a pipe, it lands and ends at end of file,
-    which occurs when the parent dies. It leaves SIGINT to the parent, because a terminal sends it to both. ``poll`` is
-    called several times a second. The updates about keys that it returns are logged and published as events.
+    with ``parent_fd``). Ends on SIGINT, SIGTERM or SIGHUP, after landing a flying vehicle within at most
+    ``land_within_s`` [s]. A second signal other than SIGHUP ends the wait. With ``parent_fd``, the reading end of a
+    pipe, it lands and ends at end of file, which occurs when the parent dies. It leaves SIGINT to the parent, because a
+    terminal sends it to both. ``poll`` is called several times a second. The updates about keys that it returns are
+    logged and published as events.
 
     Raises :class:`UsageError` (also for an invalid name or address, or a taken name) and
     :class:`skyloop.errors.DriverError`.
@@ -259,14 +266,21 @@ def at_once(
 
 @contextmanager
 def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
-    """Make SIGTERM, and unless the parent handles them SIGINT and SIGBREAK, request the end. Main thread only."""
+    """Make SIGTERM, SIGHUP, and unless the parent handles them SIGINT and SIGBREAK, request the end. Main thread only.
+
+    ``nohup`` still works: an ignored SIGHUP stays ignored.
+    """
 
     def asked(number: int, _: FrameType | None) -> None:
-        shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
+        # A terminal that is closed sends SIGHUP, its shell sends another one, and a session that ends SIGTERM as well.
+        hung_up = number == getattr(signal, "SIGHUP", None)
+        shutdown.request(f"{signal.Signals(number).name} received", hurry=False, once=hung_up)
 
     interrupts = {signal.SIGINT, getattr(signal, "SIGBREAK", signal.SIGINT)}
     before = {one: signal.signal(one, signal.SIG_IGN if ignore_interrupt else asked) for one in interrupts}
     before[signal.SIGTERM] = signal.signal(signal.SIGTERM, asked)
+    if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        before[signal.SIGHUP] = signal.signal(signal.SIGHUP, asked)
     try:
         with on_console_close(lambda: shutdown.request("its console was closed", hurry=False)):
             yield

@@ -31,7 +31,7 @@ def test_a_vehicle_with_a_deck_sends_frames_beside_its_telemetry(stream: str, mo
                     sink.link_state is LinkState.UP
                     and sink.frame_counts["front"] >= 5
                     and sink.newest is not None
-                    and bool(sink.newest.native.get("deck.frames"))
+                    and bool((sink.newest.native or {}).get("deck.frames"))
                 ),
                 WITHIN_S,
             )
@@ -41,7 +41,7 @@ def test_a_vehicle_with_a_deck_sends_frames_beside_its_telemetry(stream: str, mo
     assert sink.newest is not None
     assert {frame.encoding for frame in sink.frames} == {camera.encoding}
     assert camera.encoding is (Encoding.BGR8 if more else Encoding.MONO8)
-    assert ("deck.position_m.z" in sink.newest.native) == (stream == "state")
+    assert ("deck.position_m.z" in (sink.newest.native or {})) == (stream == "state")
 
 
 def test_a_vehicle_without_a_deck_has_no_camera() -> None:

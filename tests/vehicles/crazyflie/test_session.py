@@ -221,7 +221,8 @@ def test_an_emergency_stop_is_sent_until_it_is_seen(tmp_path: Path) -> None:
         rig.apply(ResetEmergency())
     rig.restart()  # by hand, as a locked vehicle needs
     rig.run(4.0)
-    assert rig.state is FlightState.EMERGENCY
+    state: FlightState = rig.state
+    assert state is FlightState.EMERGENCY
     rig.apply(ResetEmergency())
     rig.until(lambda: rig.state is FlightState.LANDED, 3.0)
 

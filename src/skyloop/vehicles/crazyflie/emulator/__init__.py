@@ -95,7 +95,6 @@ class RunningFirmware(RunningEmulator):
         super().__init__(host, drone, loop or "skyloop-crazyflie")
         self._settings = settings
         self._client: Address | None = None
-        self.deck: EmulatedDeck | None = None
         vehicle = host.simulation.parameters[drone]
         full_n = (
             vehicle.rotors.full_thrust_n if vehicle.rotors else vehicle.most_thrust * vehicle.mass_kg * GRAVITY_M_S2
