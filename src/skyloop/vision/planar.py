@@ -173,6 +173,7 @@ class MarkerDetector:
         self._others: Counter[tuple[str, int]] = Counter()  # count of tags from other dictionaries, by family and id
         self._other_codes: dict[str, Codes] = {}
         self._choices: dict[int, PoseChoice] = {}
+        self._steady = False  # whether the choices are made in world axes
 
     def why_nothing(self) -> str:
         """Explain why no marker was found.
@@ -225,7 +226,15 @@ class MarkerDetector:
             return []
         self._seen += 1
         at_ns, turn = getattr(image, "captured_ns", None), _camera_turn(image, camera)
-        found = [self._sighting(grey, number, corners, intrinsics, at_ns, turn) for number, corners in read]
+        if self._steady is (turn is None):  # normals in world axes and in the camera's can't be compared
+            self._steady = turn is not None
+            self._choices.clear()
+        turn, counts = np.eye(3) if turn is None else turn, Counter(number for number, _ in read)
+        found: list[MarkerSighting | None] = []
+        for number, corners in read:
+            if alike := counts[number] > 1:  # several markers with this id: which one was seen earlier is unknown
+                self._choices.pop(number, None)
+            found.append(self._sighting(grey, number, corners, intrinsics, None if alike else at_ns, turn))
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _read(self, grey: NDArray[np.uint8], quads: Array, codes: Codes) -> list[tuple[int, Array]]:
@@ -281,7 +290,7 @@ class MarkerDetector:
         best = 0
         if at_ns is not None:
             choice = self._choices.setdefault(number, PoseChoice())
-            best = choice.choose([pose.cost for pose in poses], [turn @ pose.rotation[:, 2] for pose in poses], at_ns)
+            best = choice.choose([pose.cost for pose in poses], [turn @ pose.normal for pose in poses], at_ns)
         pose, *others = poses[best], *poses[:best], *poses[best + 1 :]
         errors = [one.error * intrinsics.fx for one in (pose, *others)]
         return MarkerSighting(
@@ -296,15 +305,15 @@ class MarkerDetector:
         )
 
 
-def _camera_turn(image: Any, camera: CameraInfo | None) -> Array:
-    """Return the rotation from optical to world axes when the image was taken; the identity while it is unknown."""
+def _camera_turn(image: Any, camera: CameraInfo | None) -> Array | None:
+    """Return the rotation from optical to world axes when the image was taken; None while it is unknown."""
     feedback = getattr(image, "feedback", None)
     if camera is None or camera.rotation is None or feedback is None:
-        return np.eye(3)
+        return None
     try:
         return np.asarray(feedback.rotation @ mounting_rotation(camera))
     except ValueError:  # the attitude is unknown
-        return np.eye(3)
+        return None
 
 
 def _smallest(family: str, number: int) -> str:
