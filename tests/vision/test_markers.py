@@ -137,7 +137,7 @@ def test_a_pose_is_not_its_own_rival() -> None:
     assert np.mean(np.array(ambiguities) > 0.9) < 0.05
 
 
-class Photo(np.ndarray):  # type: ignore[type-arg]
+class Photo(np.ndarray):
     """An image with what a frame knows about it."""
 
     captured_ns = 0
@@ -152,8 +152,9 @@ def photo(image: np.ndarray, captured_s: float, feedback: Feedback | None = None
 
 def test_an_attitude_that_is_unknown_for_a_moment_does_not_turn_a_marker() -> None:
     """Normals in world axes were compared with those in the camera's, and the wrong pose was nearer."""
-    camera = CameraInfo("front", 320, 240, 30.0, INTRINSICS, rotation=FORWARD)
-    rotation, how = facing(0.5, 0.1), {"blur_px": 0.7, "noise": 6.0}
+    camera = CameraInfo("front", 320, 240, 30.0, rotation=FORWARD)
+    rotation = facing(0.5, 0.1)
+    how: dict[str, Any] = {"blur_px": 0.7, "noise": 6.0}
     image = picture([(7, rotation, np.array([0.2, 0.1, 5.5]))])
     (alone,) = MarkerDetector().detect(degraded(image, **how), INTRINSICS)
     assert alone.other is not None

@@ -46,14 +46,15 @@ def solutions(cv: Any, outline_m: Array, rays: Array, covariance: Array) -> list
     """
     count, turns, places, _ = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=cv.SOLVEPNP_IPPE_SQUARE)
     inverse = np.linalg.inv(covariance)
-    found: list[SquarePose] = []
+    found = []
     for turn, place in zip(turns[:count], places[:count], strict=True):
         position, rotation = np.asarray(place, dtype=np.float64).reshape(3), np.asarray(cv.Rodrigues(turn)[0])
         pose = _refined(cv, outline_m, rays, inverse, (position, rotation))
-        if pose and found and math.dist(pose.normal, found[0].normal) < _SAME_RAD:  # a step went beyond the ridge
-            pose = _refined(cv, outline_m, rays, inverse, (position, rotation), steps=1)
         if pose is not None:
             found.append(pose)
+    if len(found) == 2 and math.dist(found[0].normal, found[1].normal) < _SAME_RAD:  # a step went beyond the ridge
+        unrefined = _refined(cv, outline_m, rays, inverse, (position, rotation), steps=1)
+        found[1:] = [unrefined] if unrefined else []
     return sorted(found, key=lambda pose: pose.cost)
 
 
