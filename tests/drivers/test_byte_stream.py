@@ -402,6 +402,20 @@ def test_an_unplugged_port_of_windows_is_noticed(windows_port: tuple[int, Serial
         stream.write(b"x", Rank.COMMAND)
 
 
+def test_a_write_that_a_stop_cut_off_ends_no_port_of_windows(
+    windows_port: tuple[int, SerialStream, ManualClock],
+) -> None:
+    """pyserial calls it a time-out unless it reads the system's error before another call replaces that."""
+    serial = pytest.importorskip("serial")
+    _, stream, _ = windows_port
+    assert stream._threads is not None
+    stream._threads._port.write = write = Mock(side_effect=[serial.SerialTimeoutException("Write timeout"), 256, 256])
+    stream.write(b"old")
+    wait_until(lambda: write.call_count == 1, "it was cut off")
+    stream.write(b"stop", Rank.STOP)
+    wait_until(lambda: write.call_args.args[0].endswith(b"stop"), "the stop is written")
+
+
 def test_ports_are_named_as_users_write_them() -> None:
     for given in ("COM3", "com3", "/COM3", r"\\.\COM3", "//./com3"):
         assert serial_port(given) == "COM3"

@@ -10,6 +10,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import pytest
 
@@ -225,3 +227,29 @@ def test_a_serving_process_hands_over_the_interpreter_soon(monkeypatch: pytest.M
     with pytest.raises(UsageError, match="no"):
         run([], records=False, beside=beside)
     assert told == [0.001]
+
+
+@pytest.mark.parametrize("call", ["wait", "set"])
+def test_a_signal_may_arrive_while_the_main_thread_waits_or_handles_another(call: str) -> None:
+    """Event's lock cannot be taken twice: the main thread stopped forever, and the vehicle was never landed."""
+    shutdown = Shutdown()
+
+    def at_each_line(frame: FrameType, event: str, _: object) -> Any:
+        if frame.f_code.co_filename != threading.__file__:
+            return None
+        if event == "line":
+            shutdown.request("SIGTERM received", hurry=True)
+        return at_each_line
+
+    def interrupted() -> None:
+        sys.settrace(at_each_line)
+        for one in (shutdown.requested, shutdown.hurry):
+            one.wait(0.01) if call == "wait" else one.set()
+        sys.settrace(None)
+
+    thread = threading.Thread(target=interrupted, daemon=True)
+    thread.start()
+    thread.join(2.0)
+    assert not thread.is_alive()
+    assert shutdown.requested.is_set()
+    assert shutdown.hurry.is_set()

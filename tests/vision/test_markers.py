@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import sys
+import time
 from typing import Any
 
 import cv2
@@ -11,9 +13,11 @@ import numpy as np
 import pytest
 
 from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
-from skyloop.messages import CameraInfo, Intrinsics
+from skyloop.messages import CameraInfo, Feedback, FlightState, Intrinsics
 from skyloop.vision import MarkerDetector, MarkerSighting
-from skyloop.vision.marker_pose import PoseChoice
+from skyloop.vision.marker_fit import fit_pattern
+from skyloop.vision.marker_pose import PoseChoice, solutions
+from skyloop.vision.planar import rectangle
 from tests.support.marker_pictures import INTRINSICS, facing, picture, project, square
 
 FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
@@ -120,6 +124,79 @@ def test_the_right_pose_is_chosen_by_motion() -> None:
     assert choice.choose([9.0, 2.0], [right, other], 10_000_000_000) == 1
 
 
+def test_a_pose_is_not_its_own_rival() -> None:
+    """Refining both solutions of IPPE often led to the same pose, as if the marker were ambiguous."""
+    rng, outline = np.random.default_rng(1), rectangle(0.3, 0.3)
+    sigma, ambiguities = 0.1 / 280.0, []
+    for _ in range(300):
+        position = np.array([*rng.uniform(-0.3, 0.3, 2), 1.0]) * rng.uniform(0.5, 1.5)
+        seen = square(facing(*rng.uniform(-0.3, 0.3, 2)), position, 0.3)
+        rays = seen[:, :2] / seen[:, 2:] + rng.normal(0.0, sigma, (4, 2))
+        first, other = solutions(cv2, outline, rays, np.eye(8) * sigma**2)
+        ambiguities.append(first.error / other.error)
+    assert np.mean(np.array(ambiguities) > 0.9) < 0.05
+
+
+class Photo(np.ndarray):
+    """An image with what a frame knows about it."""
+
+    captured_ns = 0
+    feedback: Any = None
+
+
+def photo(image: np.ndarray, captured_s: float, feedback: Feedback | None = None) -> Photo:
+    taken = image.view(Photo)
+    taken.captured_ns, taken.feedback = round((1.0 + captured_s) * 1e9), feedback
+    return taken
+
+
+def test_an_attitude_that_is_unknown_for_a_moment_does_not_turn_a_marker() -> None:
+    """Normals in world axes were compared with those in the camera's, and the wrong pose was nearer."""
+    camera = CameraInfo("front", 320, 240, 30.0, rotation=FORWARD)
+    rotation = facing(0.5, 0.1)
+    how: dict[str, Any] = {"blur_px": 0.7, "noise": 6.0}
+    image = picture([(7, rotation, np.array([0.2, 0.1, 5.5]))])
+    (alone,) = MarkerDetector().detect(degraded(image, **how), INTRINSICS)
+    assert alone.other is not None
+    # An attitude in which the right normal in world axes is the wrong one in the camera's.
+    mounting = np.array(FORWARD).reshape(3, 3)
+    body = facing(-1.0) @ facing().T @ mounting.T
+    yaw, pitch = np.arctan2(body[1, 0], body[0, 0]), -np.arcsin(body[2, 0])
+    roll = np.arctan2(body[2, 1], body[2, 2])
+    known = Feedback(captured_ns=0, state=FlightState.FLYING, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
+    assert np.allclose(known.rotation, body)
+    assert np.linalg.norm(known.rotation @ mounting @ alone.normal - alone.other[1][:, 2]) < 0.4
+    detector = MarkerDetector()
+    for n in range(12):
+        feedback = None if n in (5, 9) else known
+        noisy = photo(degraded(image, seed=n, **how), n / 30, feedback)
+        (sighting,) = detector.detect(noisy, INTRINSICS, camera=camera)
+        assert sighting.normal @ rotation[:, 2] > 0.95, n
+
+
+def test_markers_with_the_same_id_do_not_turn_one_another() -> None:
+    left, right = facing(0.5, 0.1), facing(-0.5, 0.1)
+    image = picture([(7, left, np.array([-0.6, 0.1, 5.5])), (7, right, np.array([0.6, 0.1, 5.5]))])
+    detector = MarkerDetector()
+    for n in range(8):
+        noisy = degraded(image, blur_px=0.7, noise=6.0, seed=n)
+        together = detector.detect(photo(noisy, n / 30), INTRINSICS)
+        alone = MarkerDetector().detect(noisy, INTRINSICS)
+        assert len(together) == 2
+        for one, other in zip(together, alone, strict=True):
+            assert one.normal @ other.normal > 0.99, n
+
+
+def test_corners_that_meet_are_fitted_in_no_time() -> None:
+    """The first guess of the blur grew with the inverse of the area: its kernel would have filled the memory."""
+    image, pattern = np.full((240, 320), 90, np.uint8), np.zeros((6, 6), dtype=bool)
+    corners = np.array([[100.0, 100.0], [112.0, 100.02], [112.0, 100.0], [100.0, 100.02]])
+    begin = time.perf_counter()
+    with contextlib.suppress(np.linalg.LinAlgError):
+        fit_pattern(cv2, image, corners, pattern, lambda points: points, 1.0)
+    assert time.perf_counter() - begin < 1.0
+
+
 def test_a_marker_of_twelve_pixels_is_found() -> None:
     found = 0
     for seed in range(10):
@@ -150,6 +227,24 @@ def test_several_in_the_order_of_their_ids() -> None:
     assert [s.id for s in seen] == [3, 9, 21]
     for sighting in seen:
         assert np.linalg.norm(sighting.position_m - places[sighting.id]) < 0.06
+
+
+def test_many_markers_do_not_take_a_flight_s_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wall of 48 took half a second of a processor; the nearest ones are fitted, and the others keep their lines."""
+    fitted: list[np.ndarray] = []
+
+    def fit(cv: Any, image: np.ndarray, corners: np.ndarray, *others: Any) -> Any:
+        fitted.append(corners)
+        return fit_pattern(cv, image, corners, *others)
+
+    monkeypatch.setattr("skyloop.vision.planar.fit_pattern", fit)
+    places = [np.array([0.45 * (n % 4) - 0.7, 0.45 * (n // 4) - 0.45, 1.8 + 0.1 * n]) for n in range(12)]
+    found = MarkerDetector().detect(picture([(n, facing(), place) for n, place in enumerate(places)]), INTRINSICS)
+    assert [one.id for one in found] == list(range(12))
+    assert len(fitted) == 8
+    assert max(corners[:, 1].max() for corners in fitted) < found[-1].corners[0, 1], "the farthest is not among them"
+    for one, place in zip(found, places, strict=True):
+        assert np.abs(one.corners - project(square(facing(), place, 0.3))).max() < 0.5
 
 
 def test_body_axes() -> None:

@@ -390,6 +390,8 @@ class _PortThreads:
                     self._far.sendall(data)
 
     def _send(self) -> None:
+        from serial import SerialTimeoutException
+
         try:
             while True:
                 with self._changed:
@@ -400,7 +402,8 @@ class _PortThreads:
                     data = bytes(self._unsent[:_AT_ONCE])
                     self._writing = len(data)
                     del self._unsent[:_AT_ONCE]
-                self._port.write(data)
+                with suppress(SerialTimeoutException):  # without a time limit: emptying the buffer cut this write off
+                    self._port.write(data)
         except Exception:  # noqa: BLE001  the port was unplugged
             with self._changed:
                 self._ended = True

@@ -72,12 +72,20 @@ class LinkLines:
         return f"vehicle of {self._name}: {state.value}{why}{what}"
 
 
+class _SignalEvent(threading.Event):
+    """An event that a signal handler may set, even while the interrupted code waits for it or sets it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cond = threading.Condition(threading.RLock())  # with Event's own lock, the main thread would stop here
+
+
 class Shutdown:
     """A request to end a process that runs proxies, and how urgent the request is."""
 
     def __init__(self) -> None:
-        self.requested = threading.Event()
-        self.hurry = threading.Event()  #: set if the process must end without landing first
+        self.requested = _SignalEvent()
+        self.hurry = _SignalEvent()  #: set if the process must end without landing first
         self.reason = ""
         self._asked = False  # by a person or a program that may ask again
 

@@ -248,7 +248,7 @@ def fit_pattern(
     u, v, ones = template.u, template.v, np.ones_like(template.u)
     points = np.stack([u, v, ones], axis=1)
     shape = square_to(corners[None])[0] @ np.array([[0.5, 0, 0.5], [0, 0.5, 0.5], [0, 0, 1.0]])
-    blur = np.eye(2) * max(0.3, 0.7 / cell_px) ** 2
+    blur = np.eye(2) * min(max(0.3, 0.7 / cell_px), 1.0) ** 2
     weight, part = ones, None
     for step in range(_ITERATIONS):
         flat = points @ shape.T

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -12,6 +13,7 @@ from skyloop.clock import seconds
 from skyloop.vision.lens import Array
 
 _STEPS: Final = 5
+_SAME_RAD: Final = 0.03  # between normals: refining both poses led to the same one
 _FORGET_S: Final = 1.0  # without a sighting
 _MOST_COST: Final = 20.0  # cost by which one pose can lag behind: a wrong choice is corrected within some frames
 _TURN_RAD, _TURN_RAD_S = 0.08, 0.6  # a marker's turn between frames: standard deviation, and its growth with time
@@ -27,6 +29,10 @@ class SquarePose:
     covariance: Array  #: (6, 6), of the position, then of a rotation vector applied after ``rotation``
     error: float  #: root mean square distance of the corners' x/z and y/z
     cost: float  #: sum of squared errors in standard deviations
+
+    @property
+    def normal(self) -> Array:
+        return self.rotation[:, 2]
 
 
 def solutions(cv: Any, outline_m: Array, rays: Array, covariance: Array) -> list[SquarePose]:
@@ -47,14 +53,19 @@ def solutions(cv: Any, outline_m: Array, rays: Array, covariance: Array) -> list
         pose = _refined(cv, outline_m, rays, inverse, (position, rotation))
         if pose is not None:
             found.append(pose)
+    if len(found) == 2 and math.dist(found[0].normal, found[1].normal) < _SAME_RAD:  # a step went beyond the ridge
+        unrefined = _refined(cv, outline_m, rays, inverse, (position, rotation), steps=1)
+        found[1:] = [unrefined] if unrefined else []
     return sorted(found, key=lambda pose: pose.cost)
 
 
-def _refined(cv: Any, outline_m: Array, rays: Array, inverse: Array, start: tuple[Array, Array]) -> SquarePose | None:
+def _refined(
+    cv: Any, outline_m: Array, rays: Array, inverse: Array, start: tuple[Array, Array], steps: int = _STEPS
+) -> SquarePose | None:
     """Return the pose with the least cost near a first one (Gauss-Newton); None if it is not in front of the camera."""
     position, rotation = start
     best: SquarePose | None = None
-    for _ in range(_STEPS):
+    for _ in range(steps):
         turned = outline_m @ rotation.T
         points = turned + position
         if not np.isfinite(points).all() or (points[:, 2] <= 1e-6).any():

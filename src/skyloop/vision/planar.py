@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Self
 
@@ -123,6 +124,7 @@ _FAMILIES: Final = (
 _SIZES: Final = (50, 100, 250, 1000)
 _OTHERS_EVERY: Final = 8  #: images between attempts, made until a marker is found
 _LINES_SIGMA_PX: Final = 0.2  #: standard deviation of corners whose pattern could not be fitted
+_MOST_FITTED: Final = 8  #: markers of an image whose pattern is fitted, for some 10 ms each: the largest ones
 _FEW_IMAGES: Final = 30  #: minimum number of images for a diagnosis
 
 
@@ -173,6 +175,7 @@ class MarkerDetector:
         self._others: Counter[tuple[str, int]] = Counter()  # count of tags from other dictionaries, by family and id
         self._other_codes: dict[str, Codes] = {}
         self._choices: dict[int, PoseChoice] = {}
+        self._steady = False  # whether the choices are made in world axes
 
     def why_nothing(self) -> str:
         """Explain why no marker was found.
@@ -225,7 +228,18 @@ class MarkerDetector:
             return []
         self._seen += 1
         at_ns, turn = getattr(image, "captured_ns", None), _camera_turn(image, camera)
-        found = [self._sighting(grey, number, corners, intrinsics, at_ns, turn) for number, corners in read]
+        if self._steady is (turn is None):  # normals in world axes and in the camera's can't be compared
+            self._steady = turn is not None
+            self._choices.clear()
+        turn, counts = np.eye(3) if turn is None else turn, Counter(number for number, _ in read)
+        sizes = [self._cv.contourArea(corners.astype(np.float32)) for _, corners in read]
+        fitted = np.argsort(sizes)[-_MOST_FITTED:]
+        found: list[MarkerSighting | None] = []
+        for n, (number, corners) in enumerate(read):
+            if alike := counts[number] > 1:  # several markers with this id: which one was seen earlier is unknown
+                self._choices.pop(number, None)
+            when = None if alike else at_ns
+            found.append(self._sighting(grey, number, corners, intrinsics, when, turn, fit=n in fitted))
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _read(self, grey: NDArray[np.uint8], quads: Array, codes: Codes) -> list[tuple[int, Array]]:
@@ -252,6 +266,8 @@ class MarkerDetector:
         intrinsics: Intrinsics,
         at_ns: int | None,
         turn: Array,
+        *,
+        fit: bool,
     ) -> MarkerSighting | None:
         """Return the marker's pose; None if no square in front of the camera fits the corners."""
         focal, centre = np.array([intrinsics.fx, intrinsics.fy]), np.array([intrinsics.cx, intrinsics.cy])
@@ -266,12 +282,11 @@ class MarkerDetector:
         if not np.isfinite(ideal).all():
             return None
         covariance = np.eye(8) * _LINES_SIGMA_PX**2
-        try:
-            fit = fit_pattern(self._cv, grey, ideal, self._codes.patterns[number], to_pixels, self._finder.noise)
-        except np.linalg.LinAlgError:
-            fit = None
-        if fit is not None and all(np.isfinite(each).all() for each in fit):
-            ideal, covariance = fit
+        found, pattern = None, self._codes.patterns[number]
+        with suppress(np.linalg.LinAlgError):
+            found = fit_pattern(self._cv, grey, ideal, pattern, to_pixels, self._finder.noise) if fit else None
+        if found is not None and all(np.isfinite(each).all() for each in found):
+            ideal, covariance = found
             corners = to_pixels(ideal)
         scale = np.tile(focal, 4)
         rays = (ideal - centre) / focal
@@ -281,7 +296,7 @@ class MarkerDetector:
         best = 0
         if at_ns is not None:
             choice = self._choices.setdefault(number, PoseChoice())
-            best = choice.choose([pose.cost for pose in poses], [turn @ pose.rotation[:, 2] for pose in poses], at_ns)
+            best = choice.choose([pose.cost for pose in poses], [turn @ pose.normal for pose in poses], at_ns)
         pose, *others = poses[best], *poses[:best], *poses[best + 1 :]
         errors = [one.error * intrinsics.fx for one in (pose, *others)]
         return MarkerSighting(
@@ -296,15 +311,15 @@ class MarkerDetector:
         )
 
 
-def _camera_turn(image: Any, camera: CameraInfo | None) -> Array:
-    """Return the rotation from optical to world axes when the image was taken; the identity while it is unknown."""
+def _camera_turn(image: Any, camera: CameraInfo | None) -> Array | None:
+    """Return the rotation from optical to world axes when the image was taken; None while it is unknown."""
     feedback = getattr(image, "feedback", None)
     if camera is None or camera.rotation is None or feedback is None:
-        return np.eye(3)
+        return None
     try:
         return np.asarray(feedback.rotation @ mounting_rotation(camera))
     except ValueError:  # the attitude is unknown
-        return np.eye(3)
+        return None
 
 
 def _smallest(family: str, number: int) -> str:
