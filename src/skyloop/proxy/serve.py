@@ -290,7 +290,7 @@ def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
     if sys.platform != "win32" and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
         before[signal.SIGHUP] = signal.signal(signal.SIGHUP, asked)
     try:
-        with on_console_close(lambda: shutdown.request("its console was closed", hurry=False)):
+        with on_console_close(lambda: shutdown.request("its console was closed", hurry=False, once=True)):
             yield
     finally:
         for number, handler in before.items():

@@ -400,6 +400,9 @@ def stand_ins(system: str) -> dict[str, types.ModuleType]:
         name: _StandIn(real[name], missing) for name, missing in _MISSING[system].items()
     }
     found["sys"] = _StandIn(sys, (), platform=system)
+    if system == "darwin":  # the first counts on while the computer sleeps, as Linux's other one does not
+        clocks = {"CLOCK_MONOTONIC_RAW": time.CLOCK_BOOTTIME, "CLOCK_UPTIME_RAW": time.CLOCK_MONOTONIC}
+        found["time"].__dict__.update(clocks)
     if system == "win32":
         found |= _windows()
         found["socket"].__dict__["SO_EXCLUSIVEADDRUSE"] = _EXCLUSIVE
