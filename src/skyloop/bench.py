@@ -773,12 +773,12 @@ def _circling(world: str, drones: int, model: str = "quadrotor") -> Simulation:
 
 def rounds(seconds: float, progress: Callable[[float], None]) -> Iterator[None]:
     """Yield until the time is up, but at least :data:`LEAST_ROUNDS` times."""
-    begin, limit = time.monotonic_ns(), round(seconds * 1e9)
+    begin, limit = time.perf_counter_ns(), round(seconds * 1e9)
     done = 0
-    while done < LEAST_ROUNDS or time.monotonic_ns() - begin < limit:
+    while done < LEAST_ROUNDS or time.perf_counter_ns() - begin < limit:
         yield
         done += 1
-        progress(min(1.0, (time.monotonic_ns() - begin) / max(1, limit)))
+        progress(min(1.0, (time.perf_counter_ns() - begin) / max(1, limit)))
 
 
 @contextmanager
