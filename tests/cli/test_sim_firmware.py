@@ -90,7 +90,8 @@ def test_ports_count_from_a_base() -> None:
         (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be set with --firmware"),
         (
             ("--firmware", "ardrone3"),
-            "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'betaflight', 'px4', 'tello'",
+            "'ardrone3' is none of 'ardrone1', 'ardrone2', 'arducopter', 'betaflight', 'crazyflie', 'esp-drone', "
+            "'px4', 'tello'",
         ),
         (("--firmware", "betaflight", "--lose", "0.1"), "--lose and --delay are for datagrams"),
         (("--firmware", "ardrone2", "--lose", "1.5"), "--lose: must be at most 1"),
@@ -129,6 +130,22 @@ def test_several_autopilots_say_where_they_are_and_end_on_request(start: Callabl
     process = start("sim", "--firmware", "px4", "--drones", "2", "--world", "empty", "--port-base", "0")
     process.until("drone 1, system 2", 20.0)
     assert re.search(r"ready px4 drone 0, system 1, from udp \d+: mavlink://udpin:127.0.0.1:\d+\n", process.text)
+    process.signal(signal.SIGTERM)
+    assert process.wait() == 0
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(("firmware", "hello"), [("crazyflie", b"\xf3"), ("esp-drone", b"\xf3\xf3")])
+def test_crazyflies_answer_on_their_ports(start: Callable[..., Process], firmware: str, hello: bytes) -> None:
+    process = start("sim", "--firmware", firmware, "--drones", "2", "--world", "empty", "--port-base", "0")
+    process.until("drone 1 on", 20.0)
+    ports = re.findall(rf"ready {firmware} drone \d on 127.0.0.1: CRTP udp (\d+)\n", process.text)
+    assert len(ports) == 2
+    for port in ports:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+            client.settimeout(10.0)
+            client.sendto(hello, (HERE, int(port)))
+            assert client.recv(64) == hello
     process.signal(signal.SIGTERM)
     assert process.wait() == 0
 

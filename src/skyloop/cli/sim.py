@@ -28,11 +28,12 @@ if TYPE_CHECKING:
     from skyloop.proxy.serve import Beside
     from skyloop.sim.options import SimOptions
     from skyloop.vehicles.ardrone.emulator import ArdroneFirmware, Ports
+    from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware
     from skyloop.vehicles.mavlink.emulator import MavlinkFirmware
     from skyloop.vehicles.msp.emulator import BetaflightFirmware
     from skyloop.vehicles.tello.emulator import TelloFirmware
 
-    Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | MavlinkFirmware | TelloFirmware
+    Emulated: TypeAlias = ArdroneFirmware | BetaflightFirmware | CrazyflieFirmware | MavlinkFirmware | TelloFirmware
 
 MOST_DRONES = 100  #: maximum value of --drones
 OWN_OPTIONS = ("world", "seed", "speed")
@@ -73,7 +74,8 @@ def sim(
         FirmwareKind | None,
         typer.Option(
             metavar="KIND",
-            help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, px4 or tello",
+            help="Emulate a drone for other programs instead: ardrone1, ardrone2, arducopter, betaflight, crazyflie, "
+            "esp-drone, px4 or tello",
         ),
     ] = None,
     bind: Annotated[
@@ -99,7 +101,12 @@ def sim(
     ] = None,
     video_port: Annotated[
         int | None,
-        typer.Option(metavar="P", min=1, max=65000, help="For arducopter and px4: port to send the video to"),
+        typer.Option(
+            metavar="P",
+            min=1,
+            max=65000,
+            help="For arducopter and px4: port to send the video to; for crazyflie: port of its AI-deck's images",
+        ),
     ] = None,
     fault_seed: Annotated[int | None, typer.Option(metavar="S", min=0, help="Firmware: seed of the faults [0]")] = None,
 ) -> None:
@@ -216,11 +223,14 @@ class FirmwareKind(StrEnum):
     ARDRONE2 = "ardrone2"
     ARDUCOPTER = "arducopter"
     BETAFLIGHT = "betaflight"
+    CRAZYFLIE = "crazyflie"
+    ESP_DRONE = "esp-drone"
     PX4 = "px4"
     TELLO = "tello"
 
 
 MAVLINK: Final = (FirmwareKind.ARDUCOPTER, FirmwareKind.PX4)
+CRAZYFLIES: Final = (FirmwareKind.CRAZYFLIE, FirmwareKind.ESP_DRONE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +252,10 @@ def serve(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Ser
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
+    elif firmware in CRAZYFLIES:
+        _run(_crazyflies(options, drones, firmware, serving))
     elif serving.video_port is not None:
-        raise UsageError("--video-port is for --firmware arducopter and px4: the others have their own port")
+        raise UsageError("--video-port is for --firmware arducopter, crazyflie and px4: the others have their own port")
     elif firmware is FirmwareKind.BETAFLIGHT:
         _run(_racers(options, drones, serving))
     elif firmware is FirmwareKind.TELLO:
@@ -307,6 +319,29 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
     host = SimHost(with_racers(options), drones)
     return [
         BetaflightFirmware(host, drone, bind=serving.bind, port=base + drone if base else 0) for drone in range(drones)
+    ]
+
+
+def _crazyflies(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[CrazyflieFirmware]:
+    from skyloop.sim.host import SimHost
+    from skyloop.vehicles.crazyflie.emulator import ESP_PORT, PORT, CrazyflieFirmware, DeckSettings, with_crazyflies
+
+    checksum, video = firmware is FirmwareKind.ESP_DRONE, serving.video_port
+    usual = ESP_PORT if checksum else PORT
+    base = usual if serving.port_base is None else serving.port_base
+    host = SimHost(with_crazyflies(options), drones)
+    return [
+        CrazyflieFirmware(
+            host,
+            drone,
+            bind=serving.bind,
+            port=base + drone if base else 0,
+            checksum=checksum,
+            faults=serving.faults,
+            delay_s=serving.delay_s,
+            deck=None if video is None else DeckSettings(bind=serving.bind, port=video + drone),
+        )
+        for drone in range(drones)
     ]
 
 

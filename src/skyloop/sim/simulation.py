@@ -326,6 +326,11 @@ class Simulation:
         with self._lock:
             return np.array([state.airborne for state in self._autopilot.states])
 
+    def distance_along(self, point: Vec3, direction: Vec3) -> float:
+        """Return the distance [m] along a unit vector to the first solid, floor, or visible wall or ceiling."""
+        with self._lock:
+            return self._solids.distance_along(point, direction, self.time_s)
+
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
         """Return the states of the moving targets in the world's order, now or at a simulation time."""
         time = self.time_s if time_s is None else time_s

@@ -16,6 +16,7 @@ PACKAGES = {
     "tello": ["skyloop.vehicles.tello.wire"],
     "mavlink": ["skyloop.vehicles.mavlink.wire"],
     "msp": ["skyloop.vehicles.msp.wire"],
+    "cpx": ["skyloop.vehicles.crazyflie.wire"],
     "vrpn": ["skyloop.motion_capture.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.recording", "mcap"],
     "files": ["skyloop.sim", "skyloop.calibration", "skyloop.zones", "skyloop.drivers.uri", "tomllib"],

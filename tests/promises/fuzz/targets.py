@@ -138,6 +138,21 @@ def msp(data: bytes) -> None:
         session.drain()
 
 
+def cpx(data: bytes) -> None:
+    """What an AI-deck, or an impostor, sends: as a stream, and as packets with whole images in them."""
+    from skyloop.vehicles.crazyflie.wire.cpx import Counting, Function, Packet, PacketParser, Target
+    from skyloop.vehicles.crazyflie.wire.pictures import PictureAssembly
+
+    assembly = PictureAssembly()
+    for counting in (None, *Counting):
+        with suppress(DecodeError):
+            for packet in PacketParser(counting).feed(data):
+                assembly.feed(packet)
+    for number, part in enumerate(_parts(data)):
+        function = Function.APP if number % 3 else Function.STREAMER
+        assembly.feed(Packet(Target.GAP8, Target.HOST, function, part))
+
+
 def vrpn(data: bytes) -> None:
     """The data a VRPN motion capture server, or an impostor, sends; the results are passed on as frames."""
     from skyloop.motion_capture.pose import plausible
@@ -205,7 +220,7 @@ def page(data: bytes) -> None:
 Target = Callable[[bytes], None]
 TARGETS: Final[dict[str, Target]] = {
     target.__name__: target
-    for target in (samples, packets, proxy, ardrone, tello, mavlink, msp, vrpn, recording, files, page)
+    for target in (samples, packets, proxy, ardrone, tello, mavlink, msp, cpx, vrpn, recording, files, page)
 }
 
 

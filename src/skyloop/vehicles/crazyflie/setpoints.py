@@ -73,6 +73,7 @@ REFUSES_NS: Final = nanoseconds(2.5)  #: time after which a vehicle that doesn't
 RISES_NS: Final = nanoseconds(1.0)  #: time after the last take-off packet within which it may still rise
 FRESH_NS: Final = nanoseconds(0.5)  #: age of the newest state within which a take-off is sent
 SILENT_NS: Final = nanoseconds(0.35)  #: silence after which low-level set-points give way to a hover
+OFF_NS: Final = nanoseconds(0.5)  #: time without power after which a vehicle no longer flies, whatever it reports
 ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
 LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-off counts as finished
 NEAR_M: Final = 0.15
@@ -132,7 +133,8 @@ class CrazyflieSetpoints:
         self._heading_rad: float | None = None  # heading to keep on flights to places
         self._rises_until_ns = 0
         self._lands_until_ns = 0
-        self._landed = False  # whether a landing has ended with the motors off
+        self._landed = False  # whether the motors are off, after a landing or for a moment
+        self._off_ns: int | None = None  # since when the motors are off
         self._armed_ns: int | None = None  # when we last asked to arm
         self._disarm = False
         self._events: list[VehicleEvent] = []
@@ -343,8 +345,7 @@ class CrazyflieSetpoints:
     def on_state(self, now_ns: int) -> None:
         """Handle a new state of the telemetry."""
         self.receiving, self._state_ns = True, now_ns
-        landing = self._decision is Decision.LAND and now_ns >= self._rises_until_ns
-        self._landed = self.telemetry.motors_run is False and (self._landed or landing)
+        self._watch_motors(now_ns)
         flying = bool(self._flies(now_ns))
         rose, self._was_flying = self._was_flying, flying
         estimate = self.telemetry.estimate
@@ -364,6 +365,15 @@ class CrazyflieSetpoints:
             self._setpoint, self._steering = None, False
             if self._flight is not None and rose:
                 self._flight = None
+
+    def _watch_motors(self, now_ns: int) -> None:
+        """Notice that the motors are off: at once at the end of a landing, otherwise after a moment."""
+        if self.telemetry.motors_run is not False or self._decision is Decision.TAKE_OFF:
+            self._landed, self._off_ns = False, None
+            return
+        self._off_ns = now_ns if self._off_ns is None else self._off_ns
+        landing = self._decision is Decision.LAND and now_ns >= self._rises_until_ns
+        self._landed |= landing or now_ns - self._off_ns > OFF_NS
 
     @property
     def _arms_itself(self) -> bool | None:
