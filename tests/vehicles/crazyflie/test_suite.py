@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite, Flight, RecordingSink
@@ -16,6 +15,7 @@ from skyloop.messages import EmergencyStop, FlightState, Hover, LinkState, Reset
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
+from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 
 
 class TestCrazyflie(DriverSuite):
