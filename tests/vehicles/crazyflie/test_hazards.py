@@ -244,6 +244,20 @@ def test_arming_ends_earlier_flights_first() -> None:
     assert vehicle.run(0.1) == ["HighLevelStop", "Arm"]
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_vehicle_armed_in_vain_is_disarmed(lost: bool) -> None:
+    vehicle = Scripted({"supervisor.info": Supervisor.CAN_BE_ARMED})
+    vehicle.setpoints.apply(Takeoff(), vehicle.now_ns)
+    assert "Arm" in vehicle.run(0.1)
+    if lost:
+        vehicle.setpoints.lost(vehicle.now_ns)
+        vehicle.telemetry.forget()
+    vehicle.values["supervisor.info"] = Supervisor.IS_ARMED | Supervisor.CAN_FLY
+    sent = vehicle.run(5.0)
+    assert sent.count("Arm") == 1
+    assert ("HighLevelTakeoff" in sent) is not lost
+
+
 def test_no_number_is_sent_that_a_vehicle_cannot_read() -> None:
     assert not is_finite(GoTo(0, False, False, 1e39, 0.0, 0.0, 0.0, 1.0))
     assert not is_finite(GoTo(0, False, False, float("nan"), 0.0, 0.0, 0.0, 1.0))

@@ -140,7 +140,7 @@ class CrazyflieSetpoints:
         self._lands_until_ns = 0
         self._landed = False  # whether the motors are off, after a landing or for a moment
         self._off_ns: int | None = None  # since when the motors are off
-        self._armed_ns: int | None = None  # when we last asked to arm
+        self._armed_ns: int | None = None  # when we last asked to arm, until the vehicle has flown
         self._disarm = False
         self._events: list[VehicleEvent] = []
 
@@ -287,7 +287,7 @@ class CrazyflieSetpoints:
         if decision is self._decision:
             return
         self._decision, self._decided_ns, self._flight = decision, now_ns, None
-        self._setpoint = self._moving = self._armed_ns = self._place = None
+        self._setpoint = self._moving = self._place = None
         position = self.telemetry.estimate.position_m
         if decision is Decision.TAKE_OFF and position is not None:
             self._ground_m = position[2]
@@ -365,6 +365,7 @@ class CrazyflieSetpoints:
                 up = estimate.position_m[2] >= self._target_m - NEAR_M
                 settled = up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S
                 if settled or now_ns - self._decided_ns > nanoseconds(self._takeoff_s + LATE_S):
+                    self._armed_ns = None
                     self._decide(Decision.STAY, now_ns)
             elif rose and not flying:
                 text = "the vehicle began to take off, and its motors stopped: it is not started again"
@@ -372,13 +373,18 @@ class CrazyflieSetpoints:
         elif self._decision is Decision.LAND:
             if not flying and now_ns >= self._rises_until_ns:
                 self._decide(Decision.STAY, now_ns)
-                self._disarm = bool(self.telemetry.is_armed) and self._arms_itself is False
+                self._disarm_again()
         elif not flying:
             self._setpoint, self._steering = None, False
             if rose:
                 self._flight = None
+            if self._armed_ns is not None and now_ns >= self._rises_until_ns:  # the take-off was given up, or forgotten
+                self._disarm_again()
         elif self._flight is not None and isinstance(self._flight.message, HighLevelStop):
             self._flight = None  # it flies after all
+
+    def _disarm_again(self) -> None:
+        self._armed_ns, self._disarm = None, bool(self.telemetry.is_armed) and self._arms_itself is False
 
     def _watch_motors(self, now_ns: int) -> None:
         """Notice that the motors are off: at once at the end of a landing, otherwise after a moment."""
@@ -400,7 +406,6 @@ class CrazyflieSetpoints:
         """End a take-off; ``stop``: the vehicle, on the ground, still plans it, and may start when nothing bars it."""
         self._decide(Decision.STAY, now_ns)
         self._steering = False
-        self._disarm = self._arms_itself is False
         self._flight = _Flight(HighLevelStop()) if stop else None
         self._events.append(message(text, "no_takeoff", Severity.WARNING))
 
