@@ -9,7 +9,17 @@ import pytest
 
 from skyloop.clock import nanoseconds
 from skyloop.errors import DriverError
-from skyloop.messages import Attitude, EmergencyStop, FlightState, Hover, Land, LinkState, Takeoff, Velocity
+from skyloop.messages import (
+    Attitude,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
 from skyloop.vehicles.crazyflie.options import OWN_LIMITS, VelocityMode
 from skyloop.vehicles.crazyflie.parameters import vehicle_parameter
 from skyloop.vehicles.crazyflie.setpoints import CrazyflieSetpoints
@@ -221,7 +231,7 @@ def test_even_a_repeated_stop_reaches_a_vehicle_that_is_left_alone() -> None:
     assert "EmergencyStopMessage" in vehicle.run(0.1)
 
 
-# Nothing goes on by itself -------------------------------------------------------------------------------------------
+# Nothing starts by itself --------------------------------------------------------------------------------------------
 
 
 def test_a_repeat_does_not_take_over_what_another_client_flies(tmp_path: Path) -> None:
@@ -242,6 +252,17 @@ def test_arming_ends_earlier_flights_first() -> None:
     vehicle = Scripted({"supervisor.info": Supervisor.CAN_BE_ARMED})
     vehicle.setpoints.apply(Takeoff(), vehicle.now_ns)
     assert vehicle.run(0.1) == ["HighLevelStop", "Arm"]
+
+
+def test_recovery_after_a_crash_ends_earlier_flights_first(tmp_path: Path) -> None:
+    rig = flying(tmp_path)
+    rig.logic.flight.crash()
+    rig.until(lambda: rig.session.telemetry.is_set(Supervisor.IS_CRASHED), 1.0)
+    rig.run(3.0)
+    before = len(rig.sent)
+    rig.apply(ResetEmergency())
+    rig.run(0.1)
+    assert [type(message).__name__ for _, message in rig.sent[before:]] == ["HighLevelStop", "Recover"]
 
 
 @pytest.mark.parametrize("lost", [False, True])

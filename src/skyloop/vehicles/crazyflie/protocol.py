@@ -495,7 +495,7 @@ class CrazyflieSession(VehicleSession):
                 self._urgent.append(self._framed(CrtpPacket(NULL_PACKET.port, NULL_PACKET.channel, POWER_OFF)))
                 self._power_ns = now_ns + RESTART_NS
             else:
-                sent += [HighLevelStop(), Recover()]  # an earlier flight must not go on
+                sent += [HighLevelStop(), Recover()]  # end an earlier flight first
         return sent
 
     def _power(self, now_ns: int) -> list[bytes]:

@@ -122,7 +122,7 @@ class CrazyflieSetpoints:
         self._setpoint: Velocity | Attitude | Position | None = None  # None: hover
         self._steering = False  # whether we started or took over this flight
         self._flight: _Flight | None = None
-        #: RELAXES while low-level set-points, ours or another's, may fly the vehicle; then down to 0 as it is told.
+        #: RELAXES while low-level set-points, from us or others, may fly the vehicle; then counts the messages down.
         self._relaxes = RELAXES
         self._relax_ns = 0
         self._was_flying = False  # whether the last state was in the air
@@ -378,7 +378,7 @@ class CrazyflieSetpoints:
             self._setpoint, self._steering = None, False
             if rose:
                 self._flight = None
-            if self._armed_ns is not None and now_ns >= self._rises_until_ns:  # the take-off was given up, or forgotten
+            if self._armed_ns is not None and now_ns >= self._rises_until_ns:  # the take-off did not happen
                 self._disarm_again()
         elif self._flight is not None and isinstance(self._flight.message, HighLevelStop):
             self._flight = None  # it flies after all
@@ -485,7 +485,7 @@ class CrazyflieSetpoints:
             if self._armed_ns is not None and now_ns - self._armed_ns < ARM_NS:
                 return []
             self._armed_ns = now_ns
-            return [HighLevelStop(), Arm(True)]  # an earlier flight must not go on
+            return [HighLevelStop(), Arm(True)]  # end an earlier flight first
         sent = self._flown(now_ns)
         if sent:
             self._rises_until_ns = now_ns + RISES_NS
