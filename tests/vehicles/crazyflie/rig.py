@@ -47,6 +47,8 @@ class Rig:
         self.mute = False  # it receives, but sends nothing
         self.sent: list[tuple[float, Message]] = []  # what the driver sent to fly or stop the vehicle, with its time
         self.stops: set[int] = set()  # ports that an emergency stop was sent to
+        self.passes: Callable[[Message | None], bool] = lambda _: True  # whether the vehicle receives it
+        self.keeps: Callable[[CrtpPacket], bool] = lambda _: True  # whether the driver receives it
         self.asked = 0  # number of datagrams sent
         self.waiting: list[bytes] = []
         self._chance = random.Random(7)
@@ -74,7 +76,8 @@ class Rig:
         arrived = [packet.encode() for packet in self.logic.update(self._report())] + self.waiting
         self.waiting = []
         for datagram in arrived:
-            if self.on and not self.mute and self._chance.random() >= self._lost:
+            heard = self.on and not self.mute and self.keeps(CrtpPacket.decode(datagram))
+            if heard and self._chance.random() >= self._lost:
                 self.session.on_datagram(datagram, self.now_ns)
         if self.now_ns >= self.session.due_ns:
             self.send()
@@ -89,7 +92,7 @@ class Rig:
                 self.stops.add(packet.port)
             if message is not None:
                 self.sent.append((self.now_ns / NS_PER_S, message))
-            if self.on and not self.deaf and self._chance.random() >= self._lost:
+            if self.on and not self.deaf and self.passes(message) and self._chance.random() >= self._lost:
                 self.waiting += [HELLO] if datagram == HELLO else [a.encode() for a in self.logic.receive(packet)]
 
     def apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:

@@ -25,6 +25,7 @@ from skyloop.vehicles.crazyflie import radio
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 from skyloop.vehicles.crazyflie.options import RadioAddress
 from skyloop.vehicles.crazyflie.radio import SAFE_LINK, RadioVehicle, lease
+from skyloop.vehicles.crazyflie.wire.commander import EmergencyStopMessage
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket
 from tests.vehicles.crazyflie.rig import Rig
 
@@ -98,6 +99,37 @@ def pair() -> Iterator[tuple[socket.socket, RadioVehicle]]:
     yield ours, RadioVehicle(ONE, theirs)
     ours.close()
     theirs.close()
+
+
+class Unheard(Peer):
+    """A vehicle that hears, but whose answers do not arrive."""
+
+    def on_packet(self, packet: bytes) -> bytes | None:  # type: ignore[override]
+        super().on_packet(packet)
+        return None
+
+
+@pytest.mark.parametrize("safe", [True, None])
+@pytest.mark.parametrize("heard", [0, 1])
+def test_an_emergency_stop_reaches_a_vehicle_that_is_not_heard(
+    pair: tuple[socket.socket, RadioVehicle], safe: bool | None, heard: int
+) -> None:
+    ours, vehicle = pair
+    peer = Unheard()
+    dongle = FakeDongle({ONE: peer})
+    dongle.configure(ONE)
+    peer.safe, vehicle.safe, peer._up = True, safe, heard
+    for packet in packets(3):
+        ours.send(packet)
+    for turn in range(10):
+        vehicle.collect(nanoseconds(0.01 * turn))
+        vehicle.take_turn(dongle, nanoseconds(0.01 * turn))
+    stop = EmergencyStopMessage().encode(7)
+    ours.send(stop.encode())
+    for turn in range(10, 13):
+        vehicle.collect(nanoseconds(0.01 * turn))
+        vehicle.take_turn(dongle, nanoseconds(0.01 * turn))
+    assert stop in peer.received
 
 
 def packets(count: int) -> list[bytes]:

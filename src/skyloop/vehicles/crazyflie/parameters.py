@@ -25,7 +25,7 @@ STORE: Final = "crazyflie.store"
 FORGET: Final = "crazyflie.forget"
 NONE: Final = "none"
 #: Groups whose parameters turn motors without a flight: they can be read only.
-MOTOR_GROUPS: Final = frozenset({"motorpowerset", "health", "motortest", "system"})
+MOTOR_GROUPS: Final = frozenset({"motorpowerset", "health", "motortest", "powerdist", "system"})
 _REPORTED: Final = (
     ("firmware", "the firmware's version"),
     ("device", "the kind of vehicle"),

@@ -38,6 +38,7 @@ from skyloop.vehicles.crazyflie.wire import contents
 from skyloop.vehicles.crazyflie.wire.commander import (
     EmergencyStopMessage,
     ExternalPoseMessage,
+    HighLevelStop,
     Message,
     Recover,
     VersionQuery,
@@ -265,6 +266,7 @@ class CrazyflieSession(VehicleSession):
             self._on_console(packet.data)
             return
         if packet.port == CrtpPort.HIGH_LEVEL and len(packet.data) >= 1:
+            self.due_ns = now_ns
             self.setpoints.on_answer(packet.data[0], packet.data[3] if len(packet.data) > 3 else 0, now_ns)
             return
         for request in self._under_way:
@@ -493,7 +495,7 @@ class CrazyflieSession(VehicleSession):
                 self._urgent.append(self._framed(CrtpPacket(NULL_PACKET.port, NULL_PACKET.channel, POWER_OFF)))
                 self._power_ns = now_ns + RESTART_NS
             else:
-                sent.append(Recover())
+                sent += [HighLevelStop(), Recover()]  # end an earlier flight first
         return sent
 
     def _power(self, now_ns: int) -> list[bytes]:
@@ -534,7 +536,7 @@ class CrazyflieSession(VehicleSession):
 
     def _lose(self, reason: str, now_ns: int) -> None:
         self._received_ns = None
-        self._stage = Stage.CALLING
+        self._stage, self._knows_protocol = Stage.CALLING, False
         self._abandon()
         self._blocks.clear()
         self._watch.forget()

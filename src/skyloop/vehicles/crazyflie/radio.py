@@ -22,7 +22,14 @@ from typing import Any, Final, Protocol
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.errors import MissingExtraError
 from skyloop.vehicles.crazyflie.options import RadioAddress
-from skyloop.vehicles.crazyflie.wire.crtp import MAX_DATA, NULL_PACKET, CrtpPacket
+from skyloop.vehicles.crazyflie.wire.commander import EmergencyStopMessage
+from skyloop.vehicles.crazyflie.wire.crtp import (
+    MAX_DATA,
+    NEWEST_PROTOCOL,
+    NULL_PACKET,
+    OLDEST_PROTOCOL,
+    CrtpPacket,
+)
 
 VENDOR, PRODUCT = 0x1915, 0x7777  #: USB identity of both Crazyradios
 IDLE_NS: Final = nanoseconds(0.01)  #: time between polls of a vehicle that has nothing to say
@@ -39,6 +46,9 @@ _FULL_POWER: Final = 3
 _ACK_BYTES: Final = 0x80 | 32  # wait for acknowledgements of this many bytes
 _TIMEOUT_MS: Final = 100
 _NULL: Final = NULL_PACKET.encode()
+_STOPS: Final = frozenset(
+    EmergencyStopMessage().encode(version).encode() for version in (OLDEST_PROTOCOL, NEWEST_PROTOCOL)
+)
 
 
 class Dongle(Protocol):
@@ -131,12 +141,17 @@ class RadioVehicle:
         """
         with suppress(OSError):
             while len(self.waiting) < MOST_WAITING:
-                self.waiting.append((self.port.recv(1 + MAX_DATA), now_ns))
+                packet = self.port.recv(1 + MAX_DATA)
+                if packet in _STOPS:  # nothing goes first
+                    self.waiting = deque(waits for waits in self.waiting if waits[0] in _STOPS)
+                self.waiting.append((packet, now_ns))
         while self.waiting and now_ns - self.waiting[0][1] > STALE_NS:
             self.waiting.popleft()
 
     def take_turn(self, dongle: Dongle, now_ns: int) -> None:
         """Exchange one packet with the vehicle."""
+        if self.waiting and self.waiting[0][0] in _STOPS and (self.safe is None or self.tries):
+            self._stop(dongle, self.waiting[0][0])
         if self.safe is None:
             self._begin(dongle, now_ns)
             return
@@ -163,6 +178,11 @@ class RadioVehicle:
             with suppress(OSError):
                 self.port.send(answer[: 1 + MAX_DATA])
         self.due_ns = now_ns if carries or self.waiting else now_ns + IDLE_NS
+
+    def _stop(self, dongle: Dongle, packet: bytes) -> None:
+        """Send an emergency stop to a vehicle that is not heard but may hear, whatever packet it expects next."""
+        for self.up in (1, 0):
+            dongle.exchange(bytes((packet[0] & 0xF3 | self.up << 3 | self.down << 2,)) + packet[1:])
 
     def _begin(self, dongle: Dongle, now_ns: int) -> None:
         answer = dongle.exchange(SAFE_LINK)

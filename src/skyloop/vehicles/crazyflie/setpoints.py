@@ -41,6 +41,7 @@ from skyloop.vehicles.crazyflie.wire.commander import (
     EmergencyStopMessage,
     GoTo,
     HighLevelLand,
+    HighLevelStop,
     HighLevelTakeoff,
     HoverSetpoint,
     Message,
@@ -78,7 +79,9 @@ ARM_NS: Final = nanoseconds(0.2)  #: time between two requests to arm
 LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-off counts as finished
 NEAR_M: Final = 0.15
 SLOW_M_S: Final = 0.3
-RELAXES: Final = 3  #: how often to tell the vehicle that no more low-level set-points follow
+#: How often to tell the vehicle that no more low-level set-points follow, plus 1. The message stops the motors at once
+#: unless the high-level commander has a flight from after the last set-point, so it follows the flight's answer.
+RELAXES: Final = 4
 AHEAD_M: Final = 0.4  #: how far the planned position may be ahead of the vehicle's own, beyond 0.6 s of flight
 
 
@@ -119,7 +122,9 @@ class CrazyflieSetpoints:
         self._setpoint: Velocity | Attitude | Position | None = None  # None: hover
         self._steering = False  # whether we started or took over this flight
         self._flight: _Flight | None = None
-        self._relaxes = RELAXES  # how often to tell the vehicle that low-level set-points, if any, have ended
+        #: RELAXES while low-level set-points, from us or others, may fly the vehicle; then counts the messages down.
+        self._relaxes = RELAXES
+        self._relax_ns = 0
         self._was_flying = False  # whether the last state was in the air
         self._state_ns: int | None = None
         self._sent_ns = 0  # when the last set-point or short flight was sent
@@ -135,7 +140,7 @@ class CrazyflieSetpoints:
         self._lands_until_ns = 0
         self._landed = False  # whether the motors are off, after a landing or for a moment
         self._off_ns: int | None = None  # since when the motors are off
-        self._armed_ns: int | None = None  # when we last asked to arm
+        self._armed_ns: int | None = None  # when we last asked to arm, until the vehicle has flown
         self._disarm = False
         self._events: list[VehicleEvent] = []
 
@@ -190,13 +195,16 @@ class CrazyflieSetpoints:
     def apply(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
         """Accept an action; return what is applied within the limits. Raises :class:`DriverError`.
 
-        Only a ``new`` request starts a take-off, or takes a vehicle back that is :attr:`left_alone`, except to land it.
+        Only a ``new`` request starts a take-off, or takes over a vehicle that is :attr:`left_alone` or flown by others,
+        except to land it.
         """
-        if isinstance(action, Idle) or (not new and not isinstance(action, Land) and self.left_alone):
-            return action
         if isinstance(action, EmergencyStop):
             self._stop_motors(now_ns)
-        elif isinstance(action, ResetEmergency):
+            return action
+        others = self.left_alone or (not self._steering and bool(self._flies(now_ns)))
+        if isinstance(action, Idle) or (not new and not isinstance(action, Land | ResetEmergency) and others):
+            return action
+        if isinstance(action, ResetEmergency):
             self._reset()
         elif self.stop.active:
             if isinstance(action, Takeoff):
@@ -244,9 +252,12 @@ class CrazyflieSetpoints:
         )
 
     def _take_off(self, now_ns: int) -> None:
-        if not self.receiving or self._state_ns is None or now_ns - self._state_ns > FRESH_NS:
+        if not self.receiving or not self._is_fresh(now_ns):
             raise DriverError("no data from the vehicle: take-off is refused until the link is up")
-        if self._flies(now_ns):
+        flying = self._flies(now_ns)
+        if flying is None:
+            raise DriverError("the vehicle does not say yet whether it flies: take-off is refused until it does")
+        if flying:
             if self._decision is not Decision.TAKE_OFF:
                 self._remain(None, now_ns)
             return
@@ -268,15 +279,15 @@ class CrazyflieSetpoints:
             self._planned = self._height_m = self._place = self._heading_rad = None
             if self._setpoint is not None:
                 self._moving = None
-        if setpoint is not None and setpoint != self._setpoint:
-            self._flight = None
+        if setpoint is not None and setpoint != self._setpoint and self._relaxes != RELAXES:
+            self._flight = None  # unless its answer is awaited, to end low-level set-points
         self._setpoint = setpoint
 
     def _decide(self, decision: Decision, now_ns: int) -> None:
         if decision is self._decision:
             return
         self._decision, self._decided_ns, self._flight = decision, now_ns, None
-        self._setpoint = self._moving = self._armed_ns = self._place = None
+        self._setpoint = self._moving = self._place = None
         position = self.telemetry.estimate.position_m
         if decision is Decision.TAKE_OFF and position is not None:
             self._ground_m = position[2]
@@ -354,22 +365,34 @@ class CrazyflieSetpoints:
                 up = estimate.position_m[2] >= self._target_m - NEAR_M
                 settled = up and abs((estimate.velocity_m_s or (0.0, 0.0, 0.0))[2]) < SLOW_M_S
                 if settled or now_ns - self._decided_ns > nanoseconds(self._takeoff_s + LATE_S):
+                    self._armed_ns = None
                     self._decide(Decision.STAY, now_ns)
             elif rose and not flying:
-                self._give_up("the vehicle began to take off, and its motors stopped: it is not started again", now_ns)
+                text = "the vehicle began to take off, and its motors stopped: it is not started again"
+                self._give_up(text, now_ns, stop=not self.telemetry.motors_run)
         elif self._decision is Decision.LAND:
             if not flying and now_ns >= self._rises_until_ns:
                 self._decide(Decision.STAY, now_ns)
-                self._disarm = bool(self.telemetry.is_armed) and self._arms_itself is False
+                self._disarm_again()
         elif not flying:
             self._setpoint, self._steering = None, False
-            if self._flight is not None and rose:
+            if rose:
                 self._flight = None
+            if self._armed_ns is not None and now_ns >= self._rises_until_ns:  # the take-off did not happen
+                self._disarm_again()
+        elif self._flight is not None and isinstance(self._flight.message, HighLevelStop):
+            self._flight = None  # it flies after all
+
+    def _disarm_again(self) -> None:
+        self._armed_ns, self._disarm = None, bool(self.telemetry.is_armed) and self._arms_itself is False
 
     def _watch_motors(self, now_ns: int) -> None:
         """Notice that the motors are off: at once at the end of a landing, otherwise after a moment."""
         if self.telemetry.motors_run is not False or self._decision is Decision.TAKE_OFF:
             self._landed, self._off_ns = False, None
+            return
+        if self.telemetry.motors_ns is None or now_ns - self.telemetry.motors_ns > FRESH_NS:
+            self._off_ns = None  # they may run by now
             return
         self._off_ns = now_ns if self._off_ns is None else self._off_ns
         landing = self._decision is Decision.LAND and now_ns >= self._rises_until_ns
@@ -379,10 +402,11 @@ class CrazyflieSetpoints:
     def _arms_itself(self) -> bool | None:
         return self.telemetry.is_set(Supervisor.IS_AUTO_ARMED)
 
-    def _give_up(self, text: str, now_ns: int) -> None:
+    def _give_up(self, text: str, now_ns: int, *, stop: bool) -> None:
+        """End a take-off; ``stop``: the vehicle, on the ground, still plans it, and may start when nothing bars it."""
         self._decide(Decision.STAY, now_ns)
         self._steering = False
-        self._disarm = self._arms_itself is False
+        self._flight = _Flight(HighLevelStop()) if stop else None
         self._events.append(message(text, "no_takeoff", Severity.WARNING))
 
     def on_answer(self, kind: int, error: int, now_ns: int) -> None:
@@ -391,11 +415,22 @@ class CrazyflieSetpoints:
         if flight is None or all(layout.number != kind for layout in flight.message.LAYOUTS):
             return
         self._flight = None
-        if error and self._decision is Decision.TAKE_OFF:
-            self._give_up(f"the vehicle refuses to take off (error {error})", now_ns)
+        if self._decision is Decision.TAKE_OFF:
+            self._relaxes = 0
+            if error:
+                self._give_up(f"the vehicle refuses to take off (error {error})", now_ns, stop=False)
+        elif not error and not isinstance(flight.message, HighLevelStop):
+            self._relax(now_ns)
+
+    def _relax(self, now_ns: int) -> None:
+        """Begin to hand the vehicle over from low-level set-points to its high-level commander."""
+        if self._relaxes == RELAXES:
+            self._relaxes, self._relax_ns = RELAXES - 1, now_ns
 
     def lost(self, now_ns: int) -> None:
         """Forget take-off and set-points after a loss of the link. A landing is still sent."""
+        # It may have taken off after the last state that arrived.
+        self._was_flying |= self._state_ns is not None and self._state_ns < self._rises_until_ns
         self.receiving, self._state_ns = False, None
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
@@ -417,12 +452,20 @@ class CrazyflieSetpoints:
         if self._decision is Decision.LAND:
             if not self._may_fly(now_ns):
                 return []  # on the ground, a landing would start the motors
-            if self._flight is None and now_ns >= self._lands_until_ns:
+            # One that has landed unseen must not start its motors.
+            if self._flight is None and now_ns >= self._lands_until_ns and self._is_fresh(now_ns):
                 self._land(now_ns)
+        told: list[Message] = []
+        if 0 < self._relaxes < RELAXES and now_ns >= self._relax_ns:
+            self._relaxes, self._relax_ns = self._relaxes - 1, now_ns + AGAIN_NS
+            told = [NotifySetpointsStop()]
         steered: list[Message] = []
         if self._decision is Decision.STAY and self._steering and self._was_flying:
             steered = self._steered(now_ns)
-        return [*self._flown(now_ns), *steered]
+        return [*told, *self._flown(now_ns), *steered]
+
+    def _is_fresh(self, now_ns: int) -> bool:
+        return self._state_ns is not None and now_ns - self._state_ns <= FRESH_NS
 
     def _may_fly(self, now_ns: int) -> bool:
         flying = self._flies(now_ns)
@@ -433,23 +476,23 @@ class CrazyflieSetpoints:
         if not landed:
             self._flight = None
             return []
+        if not self._is_fresh(now_ns):
+            return []  # it may be rising
         if now_ns - self._decided_ns >= REFUSES_NS:
-            self._give_up("the vehicle did not take off: it may not be armed, or its battery is low", now_ns)
-            return []
-        if self._state_ns is None or now_ns - self._state_ns > FRESH_NS:
+            self._give_up("the vehicle did not take off: it may not be armed, or its battery is low", now_ns, stop=True)
             return []
         if self.telemetry.is_armed is False:
             if self._armed_ns is not None and now_ns - self._armed_ns < ARM_NS:
                 return []
             self._armed_ns = now_ns
-            return [Arm(True)]
+            return [HighLevelStop(), Arm(True)]  # end an earlier flight first
         sent = self._flown(now_ns)
         if sent:
             self._rises_until_ns = now_ns + RISES_NS
         return sent
 
     def _flown(self, now_ns: int) -> list[Message]:
-        """Return the flight that waits to be sent, after the end of low-level set-points where there were any."""
+        """Return the flight that waits to be sent."""
         flight = self._flight
         if flight is None or now_ns < flight.due_ns:
             return []
@@ -458,21 +501,22 @@ class CrazyflieSetpoints:
         sent = flight.message
         if flight.tries <= 0:
             self._flight = None
-        return self._high_level(sent)
-
-    def _high_level(self, sent: Message) -> list[Message]:
-        if not self._relaxes:
-            return [sent]
-        self._relaxes -= 1
-        return [NotifySetpointsStop(), sent]
+            self._lands_until_ns = min(self._lands_until_ns, flight.due_ns)
+            if not isinstance(sent, HighLevelTakeoff | HighLevelStop):
+                self._relax(flight.due_ns)  # the answers may be lost; without it, the motors would stop in any case
+        # On the ground, low-level set-points must have ended before a take-off; no motor runs that this could stop.
+        first = isinstance(sent, HighLevelTakeoff) and self._relaxes
+        return [NotifySetpointsStop(), sent] if first else [sent]
 
     def _steered(self, now_ns: int) -> list[Message]:
         setpoint = self._setpoint
+        if self._state_ns is None or now_ns - self._state_ns > SILENT_NS:
+            if not self.flies_by_setpoints:
+                return []  # if it has landed meanwhile, a flight would start its motors
+            self._setpoint = None  # no state arrives: end the vehicle's need for our set-points
+            self._hold(now_ns)
+            return self._flown(now_ns)
         if self.flies_by_setpoints:
-            if self._state_ns is None or now_ns - self._state_ns > SILENT_NS:
-                self._setpoint = None  # no state arrives: end the vehicle's need for our set-points
-                self._hold(now_ns)
-                return self._flown(now_ns)
             if now_ns - self._sent_ns < LOW_LEVEL_NS:
                 return []
             assert isinstance(setpoint, Velocity | Attitude)
@@ -490,7 +534,7 @@ class CrazyflieSetpoints:
         since_s = min(0.2, seconds(now_ns - self._sent_ns))
         held = z if self._height_m is None else self._height_m + climb * since_s
         self._height_m = within(held, z - AHEAD_M, z + AHEAD_M)
-        self._sent_ns, self._relaxes = now_ns, RELAXES
+        self._sent_ns, self._relaxes, self._flight = now_ns, RELAXES, None
         turn = math.degrees(setpoint.yaw_rate)
         if isinstance(setpoint, Velocity):
             return HoverSetpoint(setpoint.forward, setpoint.left, turn, self._height_m)
@@ -501,8 +545,12 @@ class CrazyflieSetpoints:
         changed = velocity != self._wanted or self._moving is None
         if now_ns - self._sent_ns < (HURRY_NS if changed else HIGH_LEVEL_NS):
             return []
+        if self._relaxes == RELAXES:  # the high-level commander must take over first
+            if self._flight is None:
+                self._hold(now_ns, anew=True)
+            return self._flown(now_ns)
         if velocity == Velocity():
-            if self._moving != Velocity() or self._relaxes == RELAXES:
+            if self._moving != Velocity():
                 self._hold(now_ns)
             self._wanted = velocity
             return self._flown(now_ns)
@@ -518,12 +566,12 @@ class CrazyflieSetpoints:
         self._moving, self._wanted, self._sent_ns, self._flight = eased, velocity, now_ns, None
         leg = self._leg(eased, LEG_GAIN)
         speed = math.hypot(velocity.forward, velocity.left, velocity.up)
-        if self._relaxes == RELAXES or math.dist(self._planned, estimate.position_m) > AHEAD_M + LEG_S * speed:
+        if math.dist(self._planned, estimate.position_m) > AHEAD_M + LEG_S * speed:
             # The plan is elsewhere: start from where the vehicle is.
             x, y, z = self._planned = estimate.position_m
             yaw = wrap_angle(estimate.yaw_rad + leg.yaw_rad)
             leg = replace(leg, relative=False, x_m=x + leg.x_m, y_m=y + leg.y_m, z_m=z + leg.z_m, yaw_rad=yaw)
-        return self._high_level(leg)
+        return [leg]
 
     def _leg(self, velocity: Velocity, gain: float) -> GoTo:
         """Return a short flight at a velocity, relative to the vehicle's plan."""
@@ -553,10 +601,12 @@ class CrazyflieSetpoints:
             return None
         if self.telemetry.is_locked:
             return True
-        if not self.stop.settled(self._state_ns):
-            return None
         running = self.telemetry.motors_run
-        return not self._flies(now_ns) if running is None else not running
+        seen_ns = self._state_ns if running is None else self.telemetry.motors_ns
+        if seen_ns is None or not self.stop.settled(seen_ns):
+            return None
+        running = self._flies(now_ns) if running is None else running
+        return None if running is None else not running
 
 
 def _eased(now: Velocity, wanted: Velocity, since_s: float) -> Velocity:

@@ -108,6 +108,8 @@ class CrazyflieTelemetry:
         self.values: dict[str, float] = {}
         self.parameters: dict[str, float] = {}  #: those of :data:`DECKS` and :data:`ESTIMATOR` that the vehicle has
         self.estimate = Estimate()
+        self.motors_ns: int | None = None  #: when the motors' power last arrived
+        self._motors_ran = False  # whether a motor was ever seen to have power
         self._powered_ns: int | None = None  # when thrust or a motor was last above zero
         self._health = 0  # the supervisor's bits at the last look
 
@@ -118,6 +120,9 @@ class CrazyflieTelemetry:
     def update(self, values: Mapping[str, float], now_ns: int) -> None:
         self.values.update({name: value for name, value in values.items() if math.isfinite(value)})
         self.estimate = estimate_of(self.values)
+        if _MOTORS[0] in values:
+            self.motors_ns = now_ns
+            self._motors_ran |= self._motors_run()
         if self.motors_run or self.values.get("stabilizer.thrust", 0.0) > 0:
             self._powered_ns = now_ns
 
@@ -131,10 +136,11 @@ class CrazyflieTelemetry:
 
     @property
     def motors_run(self) -> bool | None:
-        """Whether a motor has power; None if not reported."""
-        if not all(name in self.values for name in _MOTORS):
-            return None
-        return any(self.values[name] > _MOTOR_OFF for name in _MOTORS)
+        """Whether a motor has power; None if not reported, or if none ever had: these numbers may not show it."""
+        return self._motors_run() if self._motors_ran else None
+
+    def _motors_run(self) -> bool:
+        return any(self.values.get(name, 0.0) > _MOTOR_OFF for name in _MOTORS)
 
     @property
     def is_locked(self) -> bool | None:
@@ -149,7 +155,7 @@ class CrazyflieTelemetry:
         reported = self.is_set(Supervisor.IS_FLYING, "sys.isFlying")
         if reported is not None:
             return reported
-        if "stabilizer.thrust" not in self.values and self.motors_run is None:
+        if "stabilizer.thrust" not in self.values and _MOTORS[0] not in self.values:
             return None
         return self._powered_ns is not None and now_ns - self._powered_ns < FLYING_NS
 

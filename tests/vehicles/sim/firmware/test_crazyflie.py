@@ -157,6 +157,17 @@ def test_its_death_stops_the_rotors_and_its_client_goes_on_with_the_next(rig: Ri
     assert answer(rig, client) == b"\xe0two"
 
 
+def test_it_does_not_get_what_its_client_sent_while_it_was_off(rig: Rig, client: socket.socket) -> None:
+    rig.answered()
+    os.kill(rig.firmware.program.pid, signal.SIGKILL)
+    rig.until(lambda commands: commands == STOPPED, "the rotors' stop")
+    rig.event(FirmwareEventKind.DIED)
+    client.send(b"\xe0a take-off")
+    rig.event(FirmwareEventKind.ANSWERS)
+    client.send(b"\xe0later")
+    assert answer(rig, client) == b"\xe0later"
+
+
 def test_its_client_can_switch_it_off_and_it_starts_again(rig: Rig, client: socket.socket) -> None:
     rig.answered()
     client.send(SWITCH_OFF)

@@ -19,7 +19,6 @@ PORT: Final = 5000  #: TCP port of the AI-deck
 MOST_DATA: Final = 1020  #: largest amount of data in a packet from the older firmware [bytes]
 MOST_DATA_NEWER: Final = 4088  #: largest amount of data in a packet from the newer firmware [bytes]
 _HEADER: Final = struct.Struct("<HBB")  # length; route; function and version
-_ROUTE: Final = 2  # size of route and function [bytes]
 _LAST: Final = 1 << 6
 _THREE_BITS: Final = 0b111
 _FUNCTION_BITS: Final = 6

@@ -226,6 +226,8 @@ class Crazyflie(CoupledFirmware):
 
     def _send(self, readings: Readings) -> None:
         self._pace.keep()
+        if self._answered_s is None:
+            self._discard()
         if self._link is None or (self._unread > MOST_UNREAD and time.monotonic() < self._sent_s + RETRY_S):
             return  # it does not keep up: what it can't keep is lost
         if self._unread == 0:
@@ -239,6 +241,12 @@ class Crazyflie(CoupledFirmware):
             elif self._answered_s is not None:
                 self._relay()
         self._tell(encode_inertial(readings))
+
+    def _discard(self) -> None:
+        """Lose what the client sends to a vehicle that is switched off: it must not take off by it later."""
+        with suppress(OSError):
+            while self._radio is not None:
+                self._radio.recvfrom(MAX_PACKET)
 
     def _relay(self) -> None:
         """Pass on one packet of the client."""
