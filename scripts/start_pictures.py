@@ -1,6 +1,6 @@
 """Make the pictures of the first pages: the README's program on each vehicle, and a camera without a drone.
 
-``python scripts/start_pictures.py``, or ``… tello`` for one. The Tello and the Pixhawk are emulated firmware.
+``python scripts/start_pictures.py``, or ``… tello`` for one. All but the simulator are emulated firmware.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ GREEN = (90, 220, 60)
 VEHICLES = {
     "sim": ([], "sim://?cameras=front&width=640"),
     "tello": (["--firmware", "tello", "--seed", "4"], "tello://127.0.0.1"),
+    "crazyflie": (
+        ["--firmware", "crazyflie", "--seed", "4", "--video-port", "5000"],
+        "crazyflie://udp:127.0.0.1?deck=127.0.0.1:5000&fx=185",
+    ),
     "px4": (
         ["--firmware", "px4", "--seed", "4", "--video-port", "5600"],
         "mavlink://udpin:127.0.0.1:14540?camera=udp://127.0.0.1:5600&camera_width=320&camera_height=240&fx=244",
