@@ -79,6 +79,7 @@ LATE_S: Final = 3.0  #: delay after which a landing is sent again, and a take-of
 NEAR_M: Final = 0.15
 SLOW_M_S: Final = 0.3
 RELAXES: Final = 3  #: how often to tell the vehicle that no more low-level set-points follow
+UNHEARD_NS: Final = nanoseconds(0.28)  #: how long to wait for the answer to a flight before telling it so anyway
 AHEAD_M: Final = 0.4  #: how far the planned position may be ahead of the vehicle's own, beyond 0.6 s of flight
 
 
@@ -120,6 +121,8 @@ class CrazyflieSetpoints:
         self._steering = False  # whether we started or took over this flight
         self._flight: _Flight | None = None
         self._relaxes = RELAXES  # how often to tell the vehicle that low-level set-points, if any, have ended
+        self._heard = False  # whether the vehicle has answered a flight since low-level set-points
+        self._asked_ns: int | None = None  # when the first one was sent
         self._was_flying = False  # whether the last state was in the air
         self._state_ns: int | None = None
         self._sent_ns = 0  # when the last set-point or short flight was sent
@@ -387,8 +390,13 @@ class CrazyflieSetpoints:
 
     def on_answer(self, kind: int, error: int, now_ns: int) -> None:
         """Handle the high-level commander's answer to its command of this number; an error of 0: accepted."""
-        flight = self._flight
+        flight, handing_over = self._flight, bool(self._relaxes) and self._decision is not Decision.TAKE_OFF
+        newly = not self._heard and self._asked_ns is not None
+        self._heard |= newly
         if flight is None or all(layout.number != kind for layout in flight.message.LAYOUTS):
+            return
+        if handing_over:  # the vehicle has a flight to continue with: tell it that low-level set-points have ended
+            flight.due_ns = 0 if newly else flight.due_ns
             return
         self._flight = None
         if error and self._decision is Decision.TAKE_OFF:
@@ -399,7 +407,8 @@ class CrazyflieSetpoints:
         self.receiving, self._state_ns = False, None
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
-        self._setpoint, self._moving, self._relaxes = None, None, RELAXES
+        self._setpoint, self._moving = None, None
+        self._set_points_may_rule()
         if self._decision is not Decision.LAND:
             self._flight = None
 
@@ -449,7 +458,7 @@ class CrazyflieSetpoints:
         return sent
 
     def _flown(self, now_ns: int) -> list[Message]:
-        """Return the flight that waits to be sent, after the end of low-level set-points where there were any."""
+        """Return the flight that waits to be sent, with the end of low-level set-points where there were any."""
         flight = self._flight
         if flight is None or now_ns < flight.due_ns:
             return []
@@ -458,13 +467,24 @@ class CrazyflieSetpoints:
         sent = flight.message
         if flight.tries <= 0:
             self._flight = None
-        return self._high_level(sent)
+        return self._high_level(sent, now_ns)
 
-    def _high_level(self, sent: Message) -> list[Message]:
+    def _high_level(self, sent: Message, now_ns: int) -> list[Message]:
+        """Return a flight, with the end of low-level set-points where there were any.
+
+        At their end a vehicle without a new flight stops its motors, in the air: it has to know the flight before. The
+        flight is repeated for a firmware that doesn't accept one while low-level set-points rule.
+        """
         if not self._relaxes:
             return [sent]
-        self._relaxes -= 1
-        return [NotifySetpointsStop(), sent]
+        if self._decision is Decision.TAKE_OFF or self._heard:
+            self._relaxes -= 1
+            return [NotifySetpointsStop(), sent]
+        self._asked_ns = now_ns if self._asked_ns is None else self._asked_ns
+        return [sent] if now_ns - self._asked_ns < UNHEARD_NS else [sent, NotifySetpointsStop(), sent]
+
+    def _set_points_may_rule(self) -> None:
+        self._relaxes, self._heard, self._asked_ns = RELAXES, False, None
 
     def _steered(self, now_ns: int) -> list[Message]:
         setpoint = self._setpoint
@@ -490,7 +510,8 @@ class CrazyflieSetpoints:
         since_s = min(0.2, seconds(now_ns - self._sent_ns))
         held = z if self._height_m is None else self._height_m + climb * since_s
         self._height_m = within(held, z - AHEAD_M, z + AHEAD_M)
-        self._sent_ns, self._relaxes = now_ns, RELAXES
+        self._sent_ns = now_ns
+        self._set_points_may_rule()
         turn = math.degrees(setpoint.yaw_rate)
         if isinstance(setpoint, Velocity):
             return HoverSetpoint(setpoint.forward, setpoint.left, turn, self._height_m)
@@ -523,7 +544,7 @@ class CrazyflieSetpoints:
             x, y, z = self._planned = estimate.position_m
             yaw = wrap_angle(estimate.yaw_rad + leg.yaw_rad)
             leg = replace(leg, relative=False, x_m=x + leg.x_m, y_m=y + leg.y_m, z_m=z + leg.z_m, yaw_rad=yaw)
-        return self._high_level(leg)
+        return self._high_level(leg, now_ns)
 
     def _leg(self, velocity: Velocity, gain: float) -> GoTo:
         """Return a short flight at a velocity, relative to the vehicle's plan."""
