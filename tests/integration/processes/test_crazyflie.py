@@ -163,7 +163,9 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
         observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=30.0)
         land_s = time.monotonic() - begun_s
         observer.wait("landed", timeout_s=30.0)
-        print(f"pilot killed: hover {hover_s:.2f} s, land {land_s:.2f} s, landed {time.monotonic() - begun_s:.2f} s")
+        landed_s = time.monotonic() - begun_s
+        print(f"pilot killed: hover {hover_s:.2f} s, land {land_s:.2f} s, landed {landed_s:.2f} s")
+        assert landed_s - land_s > 2.0, "it fell"
 
 
 def test_without_its_proxy_it_hovers_until_the_next_lands_it(firmware: Firmware, proxy: Callable[..., Process]) -> None:
