@@ -91,6 +91,14 @@ def until(
         time.sleep(0.02)
 
 
+def ready(feedback: Feedback) -> bool:
+    """Whether the vehicle can take off: a MAVLink vehicle says so, others know where they are."""
+    native = feedback.native or {}
+    if any(name.startswith("mavlink.") for name in native):
+        return bool(native.get("mavlink.ready"))
+    return feedback.position_m is not None and not feedback.waking_up
+
+
 def place(feedback: Feedback) -> tuple[float, float, float]:
     """Return the position east, north, up [m]."""
     assert feedback.position_m is not None, "the vehicle does not report its position"

@@ -19,6 +19,7 @@ from tests.hardware.rig import (
     Rig,
     holds,
     place,
+    ready,
     runtime_folder,
     speed,
     until,
@@ -43,7 +44,7 @@ def rig(address: str) -> Iterator[Rig]:
 def test_it_gets_ready(rig: Rig) -> None:
     """It reports attitude, position and battery, and that it can be armed."""
     with rig.connect() as drone:
-        until(drone, lambda f: bool((f.native or {}).get("mavlink.ready")), READY_S, "ready to be armed")
+        until(drone, ready, READY_S, "ready to be armed")
         newest = until(
             drone, lambda f: f.position_m is not None and f.velocity_m_s is not None, 30.0, "knows its place"
         )
@@ -108,7 +109,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
 
 
 def take_off(drone: skyloop.Drone) -> None:
-    until(drone, lambda f: bool((f.native or {}).get("mavlink.ready")), READY_S, "ready to be armed")
+    until(drone, ready, READY_S, "ready to be armed")
     ground = drone.feedback().altitude_m or 0.0
     height = float(str(drone.config["limits.takeoff_altitude"]))
     if float(str(drone.config["limits.altitude"])) < height + CLIMBS_M:
@@ -222,6 +223,8 @@ def hovers(drone: skyloop.Drone) -> None:
 
 def hold_without_set_points(drone: skyloop.Drone) -> int | None:
     """Make a PX4 hold its position instead of descending when set-points stop; return the previous setting."""
+    if not any(name.startswith("mavlink.") for name in drone.feedback().native or {}):
+        return None
     name, wanted = PX4_HOLD
     deadline = time.monotonic() + 90.0
     while not any(known.startswith("mavlink.") for known in drone.config):

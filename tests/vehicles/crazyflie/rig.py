@@ -45,6 +45,7 @@ class Rig:
         self.on = True
         self.deaf = False  # it receives nothing, but sends
         self.mute = False  # it receives, but sends nothing
+        self.loses: tuple[str, ...] = ()  # kinds of messages that are lost on their way to the vehicle
         self.sent: list[tuple[float, Message]] = []  # what the driver sent to fly or stop the vehicle, with its time
         self.stops: set[int] = set()  # ports that an emergency stop was sent to
         self.passes: Callable[[Message | None], bool] = lambda _: True  # whether the vehicle receives it
@@ -92,6 +93,8 @@ class Rig:
                 self.stops.add(packet.port)
             if message is not None:
                 self.sent.append((self.now_ns / NS_PER_S, message))
+            if type(message).__name__ in self.loses:
+                continue
             if self.on and not self.deaf and self.passes(message) and self._chance.random() >= self._lost:
                 self.waiting += [HELLO] if datagram == HELLO else [a.encode() for a in self.logic.receive(packet)]
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DriverError
 from skyloop.messages import (
+    AnyAction,
     Attitude,
     EmergencyStop,
     FlightState,
@@ -307,6 +308,26 @@ def test_set_points_give_way_to_a_hover_when_nothing_is_heard(tmp_path: Path) ->
     assert kinds[-1] == "NotifySetpointsStop"
     rig.run(4.0)
     assert rig.simulation.truth(0).position_m[2] > 0.5
+
+
+@pytest.mark.parametrize("action", [Hover(), Velocity(forward=0.3), Land(), Position(0.5, 0.0, 1.0)])
+def test_after_set_points_a_late_flight_does_not_make_it_fall(tmp_path: Path, action: AnyAction) -> None:
+    """Flights are lost for 0.25 s and the end of set-points isn't: without a flight, the motors would stop."""
+    rig = flying(tmp_path)
+    for _ in range(20):
+        rig.apply(Attitude(pitch=0.05))
+        rig.run(0.05)
+    height = rig.simulation.truth(0).position_m[2]
+    rig.loses = "GoTo", "HighLevelLand"
+    rig.apply(action)
+    rig.run(0.25)
+    rig.loses = ()
+    rig.run(0.75)
+    assert rig.simulation.truth(0).position_m[2] > height - 0.25
+    assert rig.simulation.state(0).airborne
+    assert "NotifySetpointsStop" in rig.kinds()
+    rig.run(3.0)
+    assert isinstance(action, Land) or rig.simulation.truth(0).position_m[2] > height - 0.25
 
 
 def test_low_level_velocities_are_an_option(tmp_path: Path) -> None:

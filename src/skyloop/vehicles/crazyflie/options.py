@@ -17,7 +17,7 @@ CPX_PORT: Final = 5000
 CRAZYFLIE, ESP = "crazyflie", "esp"  #: dialects over UDP
 _EXAMPLES: Final = (
     "it should look like crazyflie://radio:0/80/2M/E7E7E7E7E7, crazyflie://udp:127.0.0.1:19850, "
-    "crazyflie://esp:192.168.43.42 or crazyflie://tcp:192.168.4.1:5000"
+    "or crazyflie://esp:192.168.43.42"
 )
 _RADIO: Final = re.compile(r"(\d{1,2})(?:/(\d{1,3})(?:/(250K|1M|2M)(?:/([0-9A-Fa-f]{10}))?)?)?\Z")
 
