@@ -57,4 +57,4 @@ def test_a_crazyflie_passes(start: Callable[..., Process]) -> None:
 
 @pytest.mark.skipif(not os.environ.get(VARIABLE), reason=f"{VARIABLE} is not set (docs/autopilots.md)")
 def test_a_real_crazyflies_firmware_passes() -> None:
-    passes("sim://?autopilot=crazyflie&world=empty&cameras=none&wind=0")
+    passes("sim://?autopilot=crazyflie&world=empty&cameras=none&wind=0&takeoff_altitude=2")
