@@ -107,6 +107,7 @@ def moving(drone: skyloop.Drone) -> tuple[float, float, float]:
     return place(drone)
 
 
+@pytest.mark.alone
 def test_the_marker_follower_flies_it_unchanged(firmware: Firmware, proxy: Callable[..., Process]) -> None:
     """The controller of ``skyloop demo`` sees the marker in nearly all of the deck's grey images."""
     port = free_port(socket.SOCK_STREAM)
