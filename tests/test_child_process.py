@@ -19,7 +19,7 @@ import pytest
 
 from skyloop.child_process import ChildProcess, RestartingChild, on_parent_end
 from skyloop.transport.testing import wait_until
-from tests.support.systems import PLATFORM
+from tests.support.systems import PLATFORM, only_on
 
 SOURCE = Path(__file__).parents[1] / "src"
 KILLED = "ended with exit code 1" if PLATFORM == "win32" else "was killed by signal 9"
@@ -117,6 +117,7 @@ def test_the_end_of_the_parents_pipe_is_detected() -> None:
     assert never_open.wait(20.0), "a pipe that can't be read is as good as ended"
 
 
+@only_on("linux", reason="makes itself take this system for Windows")
 def test_terminating_on_windows_leaves_a_child_time_to_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """There, ending a process kills it. A host's vehicle in a process of its own was left in the air."""
     code = (

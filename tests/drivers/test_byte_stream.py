@@ -447,7 +447,7 @@ def received(connection: socket.socket) -> tuple[bytes, bool]:
     return came, True
 
 
-@only_on("linux", "darwin", reason="Windows' own kernel resets the connection")
+@only_on("linux", reason="Windows' own kernel resets the connection, and macOS' own says what waits")
 def test_data_buffered_at_closing_are_not_delivered_later(peer: socket.socket) -> None:
     """The vehicle's network may return when no one flies it any more: it must not be armed then."""
     stream = TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())
@@ -474,6 +474,7 @@ def test_closing_on_windows_waits_for_a_second_and_then_resets(
         asking.setsockopt.assert_called_with(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("HH", 1, 1))
 
 
+@only_on("linux", "darwin", reason="Windows has no fcntl")
 def test_what_waits_to_be_sent_is_counted_on_macos(peer: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.drivers.byte_stream.sys.platform", "darwin")
     with closing(TcpStream("127.0.0.1", peer.getsockname()[1], ManualClock())) as stream, stream._socket:
@@ -484,6 +485,7 @@ def test_what_waits_to_be_sent_is_counted_on_macos(peer: socket.socket, monkeypa
         asking.getsockopt.return_value = 0
 
 
+@only_on("linux", "win32", reason="macOS' own kernel says what waits")
 @pytest.mark.parametrize("system", [PLATFORM, "win32"])
 def test_a_stalled_peer_gets_few_old_set_points(
     peer: socket.socket, system: str, monkeypatch: pytest.MonkeyPatch

@@ -92,7 +92,8 @@ class _StandIn(types.ModuleType):
             setattr(self._real, name, value)
 
     def __delattr__(self, name: str) -> None:  # tests put back what they replaced
-        setattr(self._real, name, self._before.pop(name))
+        if name in self._before:  # not if it was replaced twice, and has been put back
+            setattr(self._real, name, self._before.pop(name))
 
     def __dir__(self) -> list[str]:
         return [name for name in dir(self._real) if name not in self._missing]
