@@ -184,6 +184,14 @@ class ChildProcess:
             self._errors.close()
 
 
+class SignalEvent(threading.Event):
+    """An event that a signal handler may set, even while the interrupted code waits for it or sets it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._cond = threading.Condition(threading.RLock())  # with Event's own lock, the main thread would stop here
+
+
 @contextmanager
 def interrupt_deferred() -> Iterator[threading.Event]:
     """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at the end of the block.
@@ -191,7 +199,7 @@ def interrupt_deferred() -> Iterator[threading.Event]:
     Used to end several flights, where an exception in between would skip the remaining flights. Does nothing outside
     the main thread, or if the program handles Ctrl-C itself.
     """
-    noted = threading.Event()
+    noted = SignalEvent()
     on_main = threading.current_thread() is threading.main_thread()
     if not on_main or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield noted

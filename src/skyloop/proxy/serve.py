@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, TypeVar
 
-from skyloop.child_process import interrupt_deferred, on_parent_end
+from skyloop.child_process import SignalEvent, interrupt_deferred, on_parent_end
 from skyloop.clock import SWITCH_INTERVAL_S, monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.uri import VehicleUri
@@ -72,20 +72,12 @@ class LinkLines:
         return f"vehicle of {self._name}: {state.value}{why}{what}"
 
 
-class _SignalEvent(threading.Event):
-    """An event that a signal handler may set, even while the interrupted code waits for it or sets it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._cond = threading.Condition(threading.RLock())  # with Event's own lock, the main thread would stop here
-
-
 class Shutdown:
     """A request to end a process that runs proxies, and how urgent the request is."""
 
     def __init__(self) -> None:
-        self.requested = _SignalEvent()
-        self.hurry = _SignalEvent()  #: set if the process must end without landing first
+        self.requested = SignalEvent()
+        self.hurry = SignalEvent()  #: set if the process must end without landing first
         self.reason = ""
         self._asked = False  # by a person or a program that may ask again
 
