@@ -209,7 +209,7 @@ def test_an_ardrone_reports_what_keeps_it_down() -> None:
 
 
 def test_a_drone_checks_itself() -> None:
-    with skyloop.connect("sim://?world=empty&cameras=front&width=160", access="observe") as drone:
+    with skyloop.connect("sim://?world=empty&cameras=front&width=160", access="observe", timeout_s=60.0) as drone:
         drone.next_feedback(10.0)
         found = {finding.check: finding for finding in drone.preflight(video_s=10.0, folder=Path("recordings"))}
         assert found["link"].level is Level.OK
