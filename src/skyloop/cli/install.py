@@ -29,6 +29,7 @@ EXTRAS: Final = (
     ("control", "poses and splines", ("scipy",)),
     ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
     ("msp", "Betaflight and INAV over a serial port", ("serial",)),
+    ("crazyflie", "Crazyflie through a Crazyradio", ("usb",)),
     ("ros", "ROS 2", ("rclpy", "cv2")),
     ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
     ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),

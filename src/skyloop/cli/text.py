@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 import typer
 
 from skyloop.errors import Hint, SkyloopError
-from skyloop.platform import show_escapes
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -37,7 +36,10 @@ _COLOURS: Final = {"skyloop: ": _RED, "the controller failed": _RED, "NOT ": _RE
 def make_printable() -> None:
     """Let standard output and standard error accept any text, even if their encoding lacks some characters."""
     codecs.register_error(_PLAIN_ERRORS, _plain)
-    show_escapes()
+    if sys.platform == "win32":
+        from skyloop.platform import show_escapes
+
+        show_escapes()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper) and stream.errors in ("strict", "backslashreplace"):
             stream.reconfigure(errors=_PLAIN_ERRORS)

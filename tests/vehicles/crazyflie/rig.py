@@ -10,7 +10,7 @@ from pathlib import Path
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.vehicle_session import deliver
-from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
+from skyloop.messages import AnyAction, Feedback, FlightState, LinkState, Takeoff
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
@@ -131,3 +131,12 @@ class Rig:
     def kinds(self, since_s: float = 0.0) -> list[str]:
         """Return the names of the messages sent since a time."""
         return [type(message).__name__ for at, message in self.sent if at >= since_s]
+
+
+def flying(folder: Path, **arguments: object) -> Rig:
+    rig = Rig(folder, **arguments)  # type: ignore[arg-type]
+    rig.ready()
+    rig.run(0.3)
+    rig.apply(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 8.0)
+    return rig

@@ -34,8 +34,7 @@ from skyloop.vehicles.crazyflie.wire.commander import (
 )
 from skyloop.vehicles.crazyflie.wire.contents import Entry, ValueType
 from skyloop.vehicles.crazyflie.wire.crtp import DATA, CrtpPort
-from tests.vehicles.crazyflie.rig import Rig
-from tests.vehicles.crazyflie.test_session import flying
+from tests.vehicles.crazyflie.rig import Rig, flying
 
 STANDS = {f"stateEstimate.{name}": 0.0 for name in ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz")}
 

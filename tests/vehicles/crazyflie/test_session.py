@@ -30,18 +30,9 @@ from skyloop.vehicles.crazyflie.telemetry import MAIN
 from skyloop.vehicles.crazyflie.wire.commander import GoTo, HighLevelTakeoff, NotifySetpointsStop, decode_message
 from skyloop.vehicles.crazyflie.wire.contents import Entry, ValueType
 from skyloop.vehicles.crazyflie.wire.crtp import CrtpPacket, CrtpPort
-from tests.vehicles.crazyflie.rig import OPTIONS, Rig
+from tests.vehicles.crazyflie.rig import OPTIONS, Rig, flying
 
 MOTORS = {"HighLevelTakeoff", "HighLevelLand", "GoTo", "HoverSetpoint", "ZDistanceSetpoint", "Arm"}
-
-
-def flying(folder: Path, **arguments: object) -> Rig:
-    rig = Rig(folder, **arguments)  # type: ignore[arg-type]
-    rig.ready()
-    rig.run(0.3)
-    rig.apply(Takeoff())
-    rig.until(lambda: rig.state is FlightState.HOVERING, 8.0)
-    return rig
 
 
 # Connecting ----------------------------------------------------------------------------------------------------------
