@@ -1,17 +1,25 @@
-"""An emulated vehicle with an AI-deck, served by the driver: frames and telemetry come together."""
+"""An emulated vehicle served by the driver: its AI-deck's frames, and poses from outside."""
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
+from pathlib import Path
+
 import pytest
 
+from skyloop.clock import monotonic_ns
+from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
+from skyloop.errors import DriverError
 from skyloop.messages import Encoding, LinkState
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 from skyloop.vehicles.crazyflie.emulator.deck import DeckSettings
+from tests.vehicles.crazyflie.rig import Rig
 
 WITHIN_S = 20.0
 
@@ -47,3 +55,30 @@ def test_a_vehicle_with_a_deck_sends_frames_beside_its_telemetry(stream: str, mo
 def test_a_vehicle_without_a_deck_has_no_camera() -> None:
     driver = CrazyflieDriver(parse_uri("crazyflie://udp:127.0.0.1"))
     assert driver.capabilities().cameras == ()
+
+
+def test_a_pose_from_outside_moves_the_vehicles_estimate() -> None:
+    host = SimHost(with_crazyflies(SimOptions(world="empty", seed=1)))
+    with CrazyflieFirmware(host, port=0) as firmware:
+        driver, sink = CrazyflieDriver(parse_uri(firmware.address)), RecordingSink()
+        driver.open(sink)
+
+        def is_there() -> bool:
+            with suppress(DriverError):  # no data from the vehicle yet
+                driver.external_pose(ExternalPose((0.5, -0.25, 0.0), (0.0, 0.0, 0.0, 1.0), monotonic_ns()))
+            position = None if sink.newest is None else sink.newest.position_m
+            return position is not None and math.dist(position[:2], (0.5, -0.25)) < 0.05
+
+        try:
+            assert sink.wait(is_there, WITHIN_S)
+            assert not [each for each in driver.checkup() if each.severe]
+        finally:
+            driver.close()
+
+
+def test_no_pose_is_sent_to_a_vehicle_that_is_not_heard(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    with pytest.raises(DriverError, match="no data"):
+        rig.session.send_pose(ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), rig.now_ns), rig.now_ns)
+    rig.session.on_datagram(b"", rig.now_ns)
+    assert rig.session.counts["damaged"] == 1
