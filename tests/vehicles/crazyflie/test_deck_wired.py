@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
 from skyloop.vehicles.crazyflie.emulator.deck import DeckSettings
+from skyloop.vehicles.crazyflie.wire.contents import MiscCommand, MiscMessage
 from tests.vehicles.crazyflie.rig import Rig
 
 WITHIN_S = 20.0
@@ -82,3 +84,16 @@ def test_no_pose_is_sent_to_a_vehicle_that_is_not_heard(tmp_path: Path) -> None:
         rig.session.send_pose(ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), rig.now_ns), rig.now_ns)
     rig.session.on_datagram(b"", rig.now_ns)
     assert rig.session.counts["damaged"] == 1
+
+
+def test_a_parameter_that_the_vehicle_changes_by_itself_has_its_new_value(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.ready()
+    session = rig.session
+    (number,) = (n for n, entry in session.parameters.entries.items() if entry.full_name == "hlCommander.vland")
+    updated = MiscMessage(MiscCommand.VALUE_UPDATED, number, struct.pack("<f", 0.125))
+    session.on_datagram(updated.encode().encode(), rig.now_ns)
+    assert session.values[number] == 0.125
+    known = dict(session.values)
+    session.on_datagram(MiscMessage(MiscCommand.VALUE_UPDATED, 9999, b"1234").encode().encode(), rig.now_ns)
+    assert session.values == known
