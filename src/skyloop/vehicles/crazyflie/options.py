@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.base import OwnLimit, reject_unknown_options
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import UnknownNameError, UsageError
 
@@ -49,22 +49,6 @@ class RadioAddress:
     channel: int = 80  #: 0 to 125, at 2400 MHz + channel
     rate: str = "2M"
     address: bytes = b"\xe7" * 5
-
-
-@dataclass(frozen=True, slots=True)
-class OwnLimit:
-    """One of the driver's own limits, with its option in an address."""
-
-    name: str
-    usual: float
-    low: float
-    high: float
-    unit: str
-    text: str
-
-    @property
-    def option(self) -> str:
-        return self.name.partition(".")[2]
 
 
 TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
@@ -125,10 +109,7 @@ def options_of(uri: VehicleUri, further: frozenset[str] = frozenset()) -> Crazyf
     mode = uri.options.get("velocity", VelocityMode.HIGH_LEVEL)
     if mode not in list(VelocityMode):
         raise UnknownNameError("velocity of crazyflie://", mode, [known.value for known in VelocityMode])
-    limits = tuple(
-        (limit.name, uri.number(limit.option, limit.usual, minimum=limit.low, maximum=limit.high))
-        for limit in OWN_LIMITS
-    )
+    limits = tuple((limit.name, limit.given(uri)) for limit in OWN_LIMITS)
     rate_hz = uri.number("rate", 50.0, minimum=5.0, maximum=100.0)
     return CrazyflieOptions(LinkKind(kind), host, port, radio, VelocityMode(mode), rate_hz, limits)
 

@@ -75,13 +75,7 @@ class CrazyflieParameters:
             entries = self._entries()
             found = {name: vehicle_parameter(entry, session.values[entry.number]) for name, entry in entries.items()}
             reported = {"firmware": session.firmware, "device": session.device, "protocol": session.protocol_text}
-        kind = ParameterType.FLOAT
-        own = [
-            Parameter(
-                each.name, kind, limits[each.name], each.unit, each.low, each.high, each.usual, description=each.text
-            )
-            for each in OWN_LIMITS
-        ]
+        own = [limit.parameter(limits[limit.name]) for limit in OWN_LIMITS]
         texts = [
             Parameter(PREFIX + name, ParameterType.TEXT, reported[name], read_only=True, description=text)
             for name, text in _REPORTED

@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Final
 
-from skyloop.drivers.base import Sink, reject_unknown_options
+from skyloop.drivers.base import OwnLimit, Sink, reject_unknown_options
 from skyloop.drivers.byte_stream import serial_port
 from skyloop.drivers.live_camera import (
     INTRINSICS_OPTIONS,
@@ -32,24 +32,11 @@ TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
 ALTITUDE: Final = "limits.altitude"
 
 
-@dataclass(frozen=True, slots=True)
-class OwnLimit:
-    """One of the driver's own limits."""
-
-    name: str
-    option: str  #: name of the option in an address
-    usual: float  #: default value
-    low: float
-    high: float
-    unit: str
-    text: str
-
-
 OWN_LIMITS: Final = (
-    OwnLimit(ALTITUDE, "altitude", 3.0, 0.5, 500.0, "m", "Maximum height above the take-off point"),
-    OwnLimit("limits.climb", "climb", 1.0, 0.05, 10.0, "m/s", "Maximum vertical speed"),
-    OwnLimit("limits.speed", "speed", 2.0, 0.05, 30.0, "m/s", "Maximum horizontal speed of a velocity set-point"),
-    OwnLimit(TAKEOFF_ALTITUDE, "takeoff_altitude", 1.5, 0.5, 50.0, "m", "Height of a take-off above its start"),
+    OwnLimit(ALTITUDE, 3.0, 0.5, 500.0, "m", "Maximum height above the take-off point"),
+    OwnLimit("limits.climb", 1.0, 0.05, 10.0, "m/s", "Maximum vertical speed"),
+    OwnLimit("limits.speed", 2.0, 0.05, 30.0, "m/s", "Maximum horizontal speed of a velocity set-point"),
+    OwnLimit(TAKEOFF_ALTITUDE, 1.5, 0.5, 50.0, "m", "Height of a take-off above its start"),
 )
 USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
 
@@ -142,9 +129,7 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
     system = uri.whole("sysid", 1, minimum=1, maximum=255) if "sysid" in uri.options else None
     if system == own:
         raise UsageError(f"{uri}: sysid is the vehicle's and own_sysid is ours: they must differ")
-    limits = {
-        limit.name: uri.number(limit.option, limit.usual, minimum=limit.low, maximum=limit.high) for limit in OWN_LIMITS
-    }
+    limits = {limit.name: limit.given(uri) for limit in OWN_LIMITS}
     if limits[TAKEOFF_ALTITUDE] > limits[ALTITUDE]:
         above = f"takeoff_altitude={limits[TAKEOFF_ALTITUDE]:g} is above the ceiling of {limits[ALTITUDE]:g} m"
         raise UsageError(f"{uri}: {above}: raise that too, with altitude=…")

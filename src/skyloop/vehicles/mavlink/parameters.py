@@ -302,11 +302,7 @@ def _bound(value: float) -> float | None:
 
 def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
     """Return the driver's own limits as parameters with their current values."""
-    kind = ParameterType.FLOAT
-    return [
-        Parameter(each.name, kind, values[each.name], each.unit, each.low, each.high, each.usual, description=each.text)
-        for each in OWN_LIMITS
-    ]
+    return [limit.parameter(values[limit.name]) for limit in OWN_LIMITS]
 
 
 def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
