@@ -15,6 +15,7 @@ from urllib.parse import quote, unquote, unquote_plus
 HIDDEN: Final = "***"
 _SECRET: Final = "password|passwd|passphrase|pass|pwd|pw|token|secret|key|apikey|auth|credential|credentials"
 _SECRET_NAME: Final = re.compile(rf"(?i)(?:.*[_.-])?(?:{_SECRET})\Z")
+_HOST_NAME: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9_.-]*\Z")
 #: A secret within a path, as in ``rtsp://192.168.1.10/user=admin_password=abc_channel=1.sdp``; its end is ambiguous.
 _IN_PATH: Final = re.compile(rf"(?i)(?<![a-z])((?:{_SECRET})=)[^/?#]*")
@@ -22,6 +23,11 @@ _HOST: Final = re.compile(r"(?:\[[^\]]*\]|[^:\[\]]*)(?::\d*)?\Z")
 #: Prefixes of places that are devices. They never contain a user name, even if their path contains an ``@``.
 _DEVICES: Final = {"mavlink": ("serial:/", "serial:~")}
 _KEEP: Final = "/:@*,;=()[]~!$'+"  # punctuation that is common in addresses
+
+
+def is_host(text: str) -> bool:
+    """Return whether a text is the name or IPv4 address of a host."""
+    return _HOST_NAME.match(text) is not None
 
 
 def is_loopback(host: str) -> bool:

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
+from skyloop.messages.frame import LOOKING_DOWN, LOOKING_FORWARD
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import (
     BOTTOM_CAMERA,
     FPV_CAMERA,
     FRONT_CAMERA,
-    LOOKING_DOWN,
-    LOOKING_FORWARD,
     CameraModel,
     distort,
     looking_up,

@@ -398,32 +398,6 @@ class Driver(ABC):
         return self._apply(action)
 
 
-@dataclass(frozen=True, slots=True)
-class OwnLimit:
-    """A limit that a driver keeps itself: an option in the vehicle's address, and a parameter."""
-
-    name: str  #: name of the parameter, ``limits.`` and the option's name
-    usual: float  #: default value
-    low: float
-    high: float
-    unit: str
-    text: str
-
-    @property
-    def option(self) -> str:
-        """Name of the option."""
-        return self.name.partition(".")[2]
-
-    def given(self, uri: VehicleUri) -> float:
-        """Return the value in an address; raise :class:`UsageError` if it is out of range."""
-        return uri.number(self.option, self.usual, minimum=self.low, maximum=self.high)
-
-    def parameter(self, value: float) -> Parameter:
-        """Return the parameter with its current value."""
-        kind, text = ParameterType.FLOAT, self.text
-        return Parameter(self.name, kind, value, self.unit, self.low, self.high, self.usual, description=text)
-
-
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
     """Raise :class:`UnknownNameError` for the first option of the URI that is not in ``known``."""
     for name in uri.options:

@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from typing import Final
 from urllib.parse import parse_qsl, unquote
 
-from skyloop.address import HIDDEN, is_broken, shown_address, shown_name, without_secrets
+from skyloop.address import HIDDEN, is_broken, is_host, shown_address, shown_name, without_secrets
 from skyloop.errors import UsageError
 
-_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _SHORT_SECRET: Final = 4  # number of characters below which a secret also occurs within ordinary words
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
@@ -143,7 +142,7 @@ def host_and_port(text: str) -> tuple[str, int] | None:
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or not 1 <= int(port) <= 65_535:
         return None
-    if _HOST.match(host):
+    if is_host(host):
         return host, int(port)
     try:
         known = ipaddress.IPv6Address(host[1:-1]) if host.startswith("[") and host.endswith("]") else None

@@ -20,8 +20,9 @@ from typing import ClassVar, Final, TypeAlias
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EventKind, Idle, Land, LinkState, Parameter, ParameterType, Severity, Value
 
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: minimum time between two reported reasons while nothing is received
 _BUSY: Final = (errno.EBUSY, errno.EAGAIN)  # error numbers if another program has locked the port
@@ -29,6 +30,32 @@ _PORTS: Final = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*", "cu.usb*")  
 _MAX_LISTED_PORTS: Final = 4  # maximum number of ports that a message lists
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLimit:
+    """A limit that a driver keeps itself: an option in the vehicle's address, and a parameter."""
+
+    name: str  #: name of the parameter, ``limits.`` and the option's name
+    usual: float  #: default value
+    low: float
+    high: float
+    unit: str
+    text: str
+
+    @property
+    def option(self) -> str:
+        """Name of the option."""
+        return self.name.partition(".")[2]
+
+    def given(self, uri: VehicleUri) -> float:
+        """Return the value in an address; raise :class:`UsageError` if it is out of range."""
+        return uri.number(self.option, self.usual, minimum=self.low, maximum=self.high)
+
+    def parameter(self, value: float) -> Parameter:
+        """Return the parameter with its current value."""
+        kind, text = ParameterType.FLOAT, self.text
+        return Parameter(self.name, kind, value, self.unit, self.low, self.high, self.usual, description=text)
 
 
 def deliver(sink: Sink, pending: Iterable[SinkCallback]) -> None:

@@ -22,6 +22,10 @@ H264: Final = "h264"  #: the only codec that is recorded without decoding
 MAX_PIECE: Final = 57_000
 MAX_PIECES: Final = 64  #: maximum number of pieces of one frame
 MAX_ENCODED: Final = MAX_PIECE * MAX_PIECES  #: maximum size of a complete frame [bytes]
+#: Rotations from a camera's optical axes (x right, y down, z forward) to the body axes, row by row.
+Rotation9 = tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite]
+LOOKING_FORWARD: Final[Rotation9] = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)  #: with the image's top up
+LOOKING_DOWN: Final[Rotation9] = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)  #: with the image's top forward
 Topic = Annotated[str, msgspec.Meta(max_length=200)]
 
 
@@ -68,7 +72,7 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     encoding: Encoding = Encoding.BGR8
     intrinsics: Intrinsics | None = None
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body axes, row by row
-    rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
+    rotation: Rotation9 | None = None
     position_m: tuple[Finite, Finite, Finite] | None = None  #: position of the optical centre in body axes [m]
     stream: str = ""  #: codec of the frames available without decoding (``h264``); empty if there are none
 

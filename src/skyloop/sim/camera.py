@@ -14,18 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
-from skyloop.messages.frame import CameraInfo, Intrinsics
+from skyloop.messages.frame import LOOKING_DOWN, LOOKING_FORWARD, CameraInfo, Intrinsics, Rotation9
 
 Vec3 = tuple[float, float, float]
-Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
 
 _BLOCK: Final = 16384  #: number of points that are undistorted at a time
-
-#: Rotation "body from optical" of a level camera that faces forward, with the top of its image up.
-LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-#: Rotation "body from optical" of a camera that looks straight down, with the top of its image forward.
-LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 def looking_up(tilt_rad: float) -> Rotation9:

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
+from skyloop.address import is_host
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.live_camera import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
@@ -18,7 +19,6 @@ MAX_RATE_HZ: Final = 200.0  #: rate of full navdata
 _Meaning = TypeVar("_Meaning")
 _VERSIONS: Final = {"auto": None, "1": 1, "2": 2}
 _MODES: Final = {"demo": False, "full": True}
-_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 KNOWN: Final = {
     *("version", "navdata", "navdata_options", "rate", "video", "ids"),
     *("navdata_port", "video_port", "at_port", "control_port"),
@@ -45,7 +45,7 @@ def options_of(uri: VehicleUri) -> ArdroneOptions:
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host; it should look like ardrone://192.168.1.1")
-    if not _HOST.match(uri.place):
+    if not is_host(uri.place):
         hint = "; ports are given as options, such as ?at_port=5556" if ":" in uri.place else ""
         raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")
     check_intrinsics(uri)

@@ -25,28 +25,24 @@ from skyloop.drivers.live_video import Coded, Decoded, Decoder, LiveFrame, LiveV
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.messages.frame import H264
+from skyloop.messages.frame import H264, LOOKING_DOWN, LOOKING_FORWARD
 from skyloop.vehicles.ardrone.wire.pave import Codec, FrameType, PaveFrame, PaveParser
 from skyloop.vehicles.ardrone.wire.uvlc import UvlcDecoder, UvlcPicture, is_intra, is_p264
 
 # Cameras -------------------------------------------------------------------------------------------------------------
 
-Rotation = tuple[float, float, float, float, float, float, float, float, float]
-
-_LOOKING_FORWARD: Final[Rotation] = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-_LOOKING_DOWN: Final[Rotation] = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 _FRONT: Final = Intrinsics(
     561.999146, 561.782697, 307.433982, 190.144373, distortion=(-0.50758, 0.24911, 0.000579, 0.000996, 0.0)
 )
 _BOTTOM: Final = Intrinsics(686.994766, 688.195055, 329.323208, 159.323007)
 _CAMERAS: Final = {
     1: (
-        CameraInfo("front", 320, 240, 15.0, rotation=_LOOKING_FORWARD),
-        CameraInfo("bottom", 176, 144, 60.0, rotation=_LOOKING_DOWN),
+        CameraInfo("front", 320, 240, 15.0, rotation=LOOKING_FORWARD),
+        CameraInfo("bottom", 176, 144, 60.0, rotation=LOOKING_DOWN),
     ),
     2: (
-        CameraInfo("front", 640, 360, 30.0, intrinsics=_FRONT, rotation=_LOOKING_FORWARD, stream=H264),
-        CameraInfo("bottom", 640, 360, 30.0, intrinsics=_BOTTOM, rotation=_LOOKING_DOWN, stream=H264),
+        CameraInfo("front", 640, 360, 30.0, intrinsics=_FRONT, rotation=LOOKING_FORWARD, stream=H264),
+        CameraInfo("bottom", 640, 360, 30.0, intrinsics=_BOTTOM, rotation=LOOKING_DOWN, stream=H264),
     ),
 }
 

@@ -7,7 +7,6 @@ connection at a time and does not notice a reset one while it sends nothing, eve
 
 from __future__ import annotations
 
-import re
 import socket
 import time
 from contextlib import suppress
@@ -17,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.address import is_host
 from skyloop.clock import Clock, LiveClock, monotonic_ns, nanoseconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.live_camera import INTRINSICS_OPTIONS, check_intrinsics, intrinsics_of
@@ -24,7 +24,7 @@ from skyloop.drivers.live_video import Coded, Decoded, LiveFrame, LiveVideo, Vid
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Encoding, EventKind, Severity, Value
-from skyloop.messages.frame import image_size, why_not_decoded
+from skyloop.messages.frame import LOOKING_FORWARD, image_size, why_not_decoded
 from skyloop.platform import wait_readable
 from skyloop.vehicles.crazyflie.wire.cpx import PORT, PacketParser, encode, restart_camera
 from skyloop.vehicles.crazyflie.wire.pictures import VERSION, DeckState, Format, Picture, PictureAssembly
@@ -35,7 +35,6 @@ CAMERA: Final = "front"
 SIZES: Final = {"324x244": (324, 244), "324x324": (324, 324), "162x162": (162, 162), "162x122": (162, 122)}
 _FPS: Final = {"162x162": 60.0}  # nominal rates; others depend on the Wi-Fi
 _USUAL_FPS: Final = 15.0
-_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _OWN_OPTIONS: Final = frozenset({"deck", "deck_size", "deck_colour", "deck_restart"})
 DECK_OPTIONS: Final = _OWN_OPTIONS | INTRINSICS_OPTIONS  #: names of the options that concern the deck
 
@@ -62,9 +61,8 @@ class DeckOptions:
         """The camera as announced before the first frame."""
         width, height = self.size
         encoding = Encoding.BGR8 if self.colour else Encoding.MONO8
-        looking_forward = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
         lens = intrinsics_of(self.uri, width, height)
-        return CameraInfo(CAMERA, width, height, self.fps, encoding, lens, rotation=looking_forward)
+        return CameraInfo(CAMERA, width, height, self.fps, encoding, lens, rotation=LOOKING_FORWARD)
 
 
 def deck_options(uri: VehicleUri) -> DeckOptions | None:
@@ -78,7 +76,7 @@ def deck_options(uri: VehicleUri) -> DeckOptions | None:
             raise UsageError(f"{uri}: option {option} also needs deck, the address of the AI-deck")
         return None
     split = host_and_port(given)
-    if split is None and not _HOST.match(given):
+    if split is None and not is_host(given):
         raise UsageError(f"{uri}: deck is {given!r} and must be HOST or HOST:PORT, such as 192.168.4.1")
     size = uri.options.get("deck_size", "324x244")
     if size not in SIZES:

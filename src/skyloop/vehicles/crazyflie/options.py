@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from skyloop.drivers.base import OwnLimit, reject_unknown_options
+from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri, host_and_port
+from skyloop.drivers.vehicle_session import OwnLimit
 from skyloop.errors import UnknownNameError, UsageError
 
 UDP_PORT: Final = 19850  #: of the firmware for simulation, and of the emulated one

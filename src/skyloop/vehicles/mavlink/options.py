@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import partial
 from typing import Final
 
-from skyloop.drivers.base import OwnLimit, Sink, reject_unknown_options
+from skyloop.drivers.base import Sink, reject_unknown_options
 from skyloop.drivers.byte_stream import serial_port
 from skyloop.drivers.live_camera import (
     INTRINSICS_OPTIONS,
@@ -21,10 +21,11 @@ from skyloop.drivers.live_camera import (
     source_of,
 )
 from skyloop.drivers.uri import VehicleUri, host_and_port
+from skyloop.drivers.vehicle_session import OwnLimit
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.files import expand, read_bytes
 from skyloop.messages import CameraInfo
-from skyloop.messages.frame import H264
+from skyloop.messages.frame import H264, LOOKING_DOWN, LOOKING_FORWARD
 
 Peer = tuple[str, int] | None  #: host and port of a UDP sender; None for a stream
 
@@ -45,8 +46,8 @@ DEFAULT_BAUD: Final = 57_600  #: usual speed of telemetry radios [bit/s]
 #: Rotations from a camera's optical axes (right, down, forward) to body axes, row by row. The top of the image points
 #: up or, for a camera that looks down, forward.
 FACINGS: Final = {
-    "forward": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
-    "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+    "forward": LOOKING_FORWARD,
+    "down": LOOKING_DOWN,
 }
 _EXAMPLES: Final = (
     "it should look like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, "

@@ -10,6 +10,7 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, Encoding
+from skyloop.messages.frame import LOOKING_DOWN, LOOKING_FORWARD, Rotation9
 from skyloop.vehicles.ros2.node import MOST_DOMAIN
 
 #: Default topics by the option that names them; names without a leading slash are relative to the namespace.
@@ -30,11 +31,10 @@ _OTHERS: Final = (
 )
 KNOWN: Final = {*TOPICS, *SERVICES, *_OTHERS}
 _NAME: Final = re.compile(r"/?[A-Za-z_]\w*(/[A-Za-z_]\w*)*\Z", re.ASCII)
-Rotation = tuple[float, float, float, float, float, float, float, float, float]
 #: Camera mounts: the camera's optical axes (x right, y down, z forward) in body axes, row by row.
-MOUNTS: Final[dict[str, Rotation | None]] = {
-    "ahead": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
-    "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+MOUNTS: Final[dict[str, Rotation9 | None]] = {
+    "ahead": LOOKING_FORWARD,
+    "down": LOOKING_DOWN,
     "unknown": None,
 }
 

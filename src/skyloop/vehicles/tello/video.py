@@ -18,7 +18,7 @@ from skyloop.drivers.live_video import Coded, Decoded
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_link import MAX_DATAGRAM
 from skyloop.messages import CameraInfo, Intrinsics
-from skyloop.messages.frame import H264
+from skyloop.messages.frame import H264, LOOKING_FORWARD
 from skyloop.platform import wait_readable
 from skyloop.pyav import new_decoder, require_pyav
 from skyloop.vehicles.tello.link import receiving_socket
@@ -44,7 +44,7 @@ _CAMERAS: Final = (
         720,
         30.0,
         intrinsics=_CALIBRATION,
-        rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
+        rotation=LOOKING_FORWARD,
         position_m=(0.05, 0.0, 0.0),
         stream=H264,
     ),
