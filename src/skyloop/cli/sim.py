@@ -324,10 +324,11 @@ def _racers(options: SimOptions, drones: int, serving: Serving) -> list[Betaflig
 
 def _crazyflies(options: SimOptions, drones: int, firmware: FirmwareKind, serving: Serving) -> list[CrazyflieFirmware]:
     from skyloop.sim.host import SimHost
-    from skyloop.vehicles.crazyflie.emulator import ESP_PORT, PORT, CrazyflieFirmware, DeckSettings, with_crazyflies
+    from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, DeckSettings, with_crazyflies
+    from skyloop.vehicles.crazyflie.wire.crtp import ESP_PORT, UDP_PORT
 
     checksum, video = firmware is FirmwareKind.ESP_DRONE, serving.video_port
-    usual = ESP_PORT if checksum else PORT
+    usual = ESP_PORT if checksum else UDP_PORT
     base = usual if serving.port_base is None else serving.port_base
     host = SimHost(with_crazyflies(options), drones)
     return [

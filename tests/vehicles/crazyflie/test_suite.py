@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from skyloop.drivers.base import Driver
-from skyloop.drivers.suite import DriverSuite, Flight, RecordingSink
+from skyloop.drivers.suite import RecordingSink
 from skyloop.drivers.uri import parse_uri
-from skyloop.messages import EmergencyStop, FlightState, Hover, LinkState, ResetEmergency
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.vehicles.crazyflie.driver import CrazyflieDriver
 from skyloop.vehicles.crazyflie.emulator import CrazyflieFirmware, with_crazyflies
+from tests.vehicles.crazyflie.suite import CrazyflieSuite
 
 
-class TestCrazyflie(DriverSuite):
+class TestCrazyflie(CrazyflieSuite):
     uri = "crazyflie://udp:127.0.0.1"
     connect_timeout_s = 20.0
     feedback_timeout_s = 10.0
@@ -44,21 +43,11 @@ class TestCrazyflie(DriverSuite):
     def vehicle_appears(self) -> None:
         self.firmware.start()
 
-    def test_emergency_stop_and_reset(self) -> None:
-        """As in the suite, but a locked Crazyflie has to be switched off and on before the reset."""
-        with self.opened(watch=set()) as (driver, sink):
-            flight = Flight(self, driver, sink)
-            driver.apply(EmergencyStop())
-            flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
-            driver.apply(Hover())
-            time.sleep(0.2)
-            flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
-            self.firmware.stop()
-            assert sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
-            self.firmware.start()
-            assert sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
-            driver.apply(ResetEmergency())
-            flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
+    def switch_off(self) -> None:
+        self.firmware.stop()
+
+    def switch_on(self) -> None:
+        self.firmware.start()
 
 
 def test_esp_drones_dialect(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

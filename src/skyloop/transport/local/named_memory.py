@@ -96,16 +96,18 @@ class NamedSlot(SlotMemory):
         begin = prefix()
         self._owner = _process
         self._owner.keep()
-        for _ in range(len(self._owner.free)):
-            self._index = self._owner.free.popleft()
-            self._name = f"{begin}-{self._index:x}"
-            try:
-                view = _create(self._name, _OFFSET + self.capacity)
-                break
-            except FileExistsError:  # on Windows, a client still has the memory that had this name
-                self._owner.free.append(self._index)
-                self._index = -1
-        else:
+        view = None
+        with suppress(IndexError):  # other threads took the last names
+            for _ in range(len(self._owner.free)):
+                self._index = self._owner.free.popleft()
+                self._name = f"{begin}-{self._index:x}"
+                try:
+                    view = _create(self._name, _OFFSET + self.capacity)
+                    break
+                except FileExistsError:  # on Windows, a client still has the memory that had this name
+                    self._owner.free.append(self._index)
+                    self._index = -1
+        if view is None:
             raise OSError(errno.ENOSPC, f"this process has {MOST} slots")
         view[: _HEADER.size] = _HEADER.pack(_MAGIC, self.number, 0, self.capacity)
         return np.frombuffer(view, np.uint8, self.capacity, _OFFSET)

@@ -11,9 +11,8 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri, host_and_port
 from skyloop.drivers.vehicle_session import OwnLimit
 from skyloop.errors import UnknownNameError, UsageError
+from skyloop.vehicles.crazyflie.wire.crtp import ESP_PORT, UDP_PORT
 
-UDP_PORT: Final = 19850  #: of the firmware for simulation, and of the emulated one
-ESP_PORT: Final = 2390
 CPX_PORT: Final = 5000
 CRAZYFLIE, ESP = "crazyflie", "esp"  #: dialects over UDP
 _EXAMPLES: Final = (

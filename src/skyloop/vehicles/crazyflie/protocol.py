@@ -61,6 +61,8 @@ from skyloop.vehicles.crazyflie.wire.crtp import (
     NEWEST_PROTOCOL,
     NULL_PACKET,
     OLDEST_PROTOCOL,
+    POWER_OFF,
+    POWER_ON,
     CrtpPacket,
     CrtpPort,
     with_checksum,
@@ -80,7 +82,6 @@ FIRST_DATA_NS: Final = nanoseconds(2.0)
 CLOCK_WINDOW_S: Final = 1.0  #: window of the estimate of the vehicle's clock, which is slow in a starved simulation
 STAMPS: Final = 1 << 24  #: log time stamps [ms] begin again there
 MAX_CONSOLE: Final = 400  #: longest line kept from the console [characters]
-POWER_OFF, POWER_ON = b"\xfe\x02", b"\xfe\x03"  #: in a null packet: switch the vehicle's main processor
 RESTART_NS: Final = nanoseconds(0.3)  #: how long it stays off
 
 #: Parameter of older firmware that switches the high-level commander on.
@@ -492,7 +493,7 @@ class CrazyflieSession(VehicleSession):
         if self.setpoints.reset_wanted:
             self.setpoints.reset_wanted = False
             if self.telemetry.is_locked:
-                self._urgent.append(self._framed(CrtpPacket(NULL_PACKET.port, NULL_PACKET.channel, POWER_OFF)))
+                self._urgent.append(self._framed(POWER_OFF))
                 self._power_ns = now_ns + RESTART_NS
             else:
                 sent += [HighLevelStop(), Recover()]  # end an earlier flight first
@@ -502,7 +503,7 @@ class CrazyflieSession(VehicleSession):
         if self._power_ns is None or now_ns < self._power_ns:
             return []
         self._power_ns = None
-        return [self._framed(CrtpPacket(NULL_PACKET.port, NULL_PACKET.channel, POWER_ON))]
+        return [self._framed(POWER_ON)]
 
     def _calls(self) -> list[bytes]:
         ask = self._framed(ask_version(VersionQuery.PROTOCOL))

@@ -23,6 +23,7 @@ from skyloop.vehicles.sim.firmware import ports
 from skyloop.vehicles.sim.firmware.betaflight import program_path
 from tests.support.processes import PILOTS, Process, eventually, proxy, sockets, start
 from tests.vehicles.sim.firmware.real_betaflight import real_betaflight
+from tests.vehicles.sim.firmware.suite import process_in
 
 __all__ = ["proxy", "sockets", "start"]  # fixtures
 
@@ -79,15 +80,6 @@ def ready(drone: skyloop.Drone) -> None:
     eventually(lambda: drone.link.vehicle is LinkState.UP and flags(drone) == "", "arming is possible", PATIENCE_S)
 
 
-def process_in(folder: Path) -> int:
-    """Return the process id of the firmware that runs in a folder, or 0."""
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if (process / "cwd").readlink() == folder and str((process / "exe").readlink()) == program_path():
-                return int(process.name)
-    return 0
-
-
 @pytest.mark.alone
 def test_it_follows_the_marker_and_is_safe_without_link_pilot_or_firmware(
     proxy: Callable[..., Process], start: Callable[..., Process], tmp_path: Path
@@ -125,7 +117,7 @@ def _is_refused_by_name(drone: skyloop.Drone) -> None:
 
 
 def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
-    first = process_in(folder)
+    first = process_in(folder, program_path())
     os.kill(first, signal.SIGKILL)
 
     def told(reason: str) -> bool:
@@ -133,7 +125,7 @@ def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
 
     eventually(lambda: told("firmware_died") and told("firmware_started"), "both are reported", PATIENCE_S)
     eventually(lambda: flags(drone) == "", "the next one can be armed", PATIENCE_S)
-    assert process_in(folder) not in (0, first)
+    assert process_in(folder, program_path()) not in (0, first)
 
 
 def _survives_a_cut(drone: skyloop.Drone) -> None:
@@ -185,9 +177,11 @@ def test_another_flies_in_a_separate_network(start: Callable[..., Process], tmp_
         assert abs(places[0][0] - places[1][0]) > 0.5, "each gets its own position"
         eventually(lambda: is_paralyzed(one), "one has its reason", PATIENCE_S)
         assert flags(two) == "", "the other has none"
-    assert all(process_in(folder) for folder in folders)
+    assert all(process_in(folder, program_path()) for folder in folders)
     several.signal(signal.SIGKILL)
-    eventually(lambda: not any(process_in(folder) for folder in folders), "both end with it", PATIENCE_S)
+    eventually(
+        lambda: not any(process_in(folder, program_path()) for folder in folders), "both end with it", PATIENCE_S
+    )
 
 
 @pytest.mark.alone

@@ -21,6 +21,7 @@ from skyloop.errors import RefusedError
 from skyloop.messages import Failsafe, FlightState, LinkState
 from skyloop.vehicles.sim.firmware.crazyflie import VARIABLE
 from tests.support.processes import PILOTS, Process, eventually, proxy, sockets, start
+from tests.vehicles.sim.firmware.suite import process_in
 
 __all__ = ["proxy", "sockets", "start"]  # fixtures
 
@@ -31,6 +32,7 @@ pytestmark = [
     pytest.mark.skipif(not os.environ.get(VARIABLE), reason=f"{VARIABLE} is not set (docs/autopilots.md)"),
 ]
 
+PROGRAM = str(Path(os.environ.get(VARIABLE, "")).resolve())
 FLIGHT = "sim://?autopilot=crazyflie&world=empty&cameras=none&wind=0"
 WORLD = str(Path(__file__).with_name("crazyflie_world.py"))
 PATIENCE_S = 60.0
@@ -67,16 +69,6 @@ def go(drone: skyloop.Drone, x: float, y: float) -> None:
 def heights_m(told: Path) -> list[float]:
     """Return the heights that a world has told so far."""
     return [float(line) for line in told.read_text().split("\n")[:-1]]
-
-
-def process_in(folder: Path) -> int:
-    """Return the process id of the firmware that runs in a folder, or 0."""
-    program = Path(os.environ[VARIABLE]).resolve()
-    for process in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            if (process / "cwd").readlink() == folder and (process / "exe").readlink() == program:
-                return int(process.name)
-    return 0
 
 
 def test_it_flies_a_square_and_is_safe_without_link_pilot_or_firmware(
@@ -145,14 +137,14 @@ def _lands_without_its_pilot(observer: skyloop.Drone, start: Callable[..., Proce
 def _comes_back_after_its_death(drone: skyloop.Drone, folder: Path) -> None:
     ready(drone)
     take_off(drone)
-    first = process_in(folder)
+    first = process_in(folder, PROGRAM)
     os.kill(first, signal.SIGKILL)
     begun_s = time.monotonic()
     eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is reported", PATIENCE_S)
     lost_s = time.monotonic() - begun_s
     ready(drone)
     print(f"firmware killed: lost {lost_s:.2f} s, ready again {time.monotonic() - begun_s:.2f} s later")
-    assert process_in(folder) not in (0, first)
+    assert process_in(folder, PROGRAM) not in (0, first)
     assert truth(drone)[2] < 0.1, "its rotors stopped"
     take_off(drone)
     drone.land(timeout_s=PATIENCE_S)
@@ -202,6 +194,6 @@ def test_several_fly_at_once(start: Callable[..., Process], tmp_path: Path) -> N
         for drone in (one, two):
             drone.land(timeout_s=PATIENCE_S)
     folders = [tmp_path / "drone1", tmp_path / "drone2"]
-    assert all(process_in(folder) for folder in folders)
+    assert all(process_in(folder, PROGRAM) for folder in folders)
     several.signal(signal.SIGKILL)
-    eventually(lambda: not any(process_in(folder) for folder in folders), "both end with it", PATIENCE_S)
+    eventually(lambda: not any(process_in(folder, PROGRAM) for folder in folders), "both end with it", PATIENCE_S)

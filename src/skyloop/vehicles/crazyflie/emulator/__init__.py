@@ -35,6 +35,7 @@ from skyloop.vehicles.crazyflie.emulator.logic import PROTOCOL, CrazyflieLogic
 from skyloop.vehicles.crazyflie.wire.crtp import (
     NEWEST_PROTOCOL,
     OLDEST_PROTOCOL,
+    UDP_PORT,
     CrtpPacket,
     with_checksum,
     without_checksum,
@@ -52,8 +53,6 @@ from skyloop.vehicles.emulation.flight import SimulatedVehicle
 
 __all__ = ["CrazyflieFirmware", "DeckSettings", "Faults", "with_crazyflies"]
 
-PORT: Final = 19850  #: UDP port of the first vehicle; programs for simulated Crazyflies look there
-ESP_PORT: Final = 2390  #: UDP port of ESP-Drone and LiteWing
 REPORTS_HZ: Final = 100.0  #: rate at which the simulation reports to the firmware
 _RANGE_M: Final = 4.0  # range of the Multi-ranger's sensors
 #: Directions of the range finders: forward, left, up.
@@ -202,7 +201,7 @@ class CrazyflieFirmware(Emulator[RunningFirmware]):
         drone: int = 0,
         *,
         bind: str = "127.0.0.1",
-        port: int = PORT,
+        port: int = UDP_PORT,
         protocol: int = PROTOCOL,
         auto_arm: bool = True,
         checksum: bool = False,

@@ -11,6 +11,8 @@ from typing import Final
 
 from skyloop.errors import DecodeError
 
+UDP_PORT: Final = 19850  #: of the first simulated vehicle, real firmware or emulated; programs look for them there
+ESP_PORT: Final = 2390  #: UDP port of ESP-Drone and LiteWing
 MAX_DATA: Final = 31  #: largest number of bytes after the header
 #: Largest number of bytes in a packet of ours: older firmware has room for no more.
 MAX_SENT_DATA: Final = 30
@@ -79,6 +81,9 @@ class CrtpPacket:
 #: What the firmware for simulation sends to whoever it listens to, and expects before anything else.
 HELLO: Final = b"\xf3"
 NULL_PACKET: Final = CrtpPacket(CrtpPort.LINK, NULL)
+#: For a vehicle's radio, which switches the rest of the vehicle off and on.
+POWER_OFF: Final = CrtpPacket(CrtpPort.LINK, NULL, b"\xfe\x02")
+POWER_ON: Final = CrtpPacket(CrtpPort.LINK, NULL, b"\xfe\x03")
 
 
 def with_checksum(packet: bytes) -> bytes:

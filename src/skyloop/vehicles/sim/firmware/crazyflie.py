@@ -39,6 +39,7 @@ from typing import ClassVar, Final
 from skyloop.errors import DecodeError
 from skyloop.sim.instruments import ALTITUDE_M, Readings
 from skyloop.sim.parameters import GRAVITY_M_S2
+from skyloop.vehicles.crazyflie.wire.crtp import HELLO, MAX_DATA, NULL_PACKET, POWER_OFF, UDP_PORT
 from skyloop.vehicles.sim.firmware.ports import LOOPBACK, bound, release_instance, reserve_instance
 from skyloop.vehicles.sim.firmware.program import (
     Commands,
@@ -54,8 +55,7 @@ VARIABLE: Final = "SKYLOOP_CRAZYFLIE"
 WHERE: Final = (
     "How to get it: https://github.com/llanesc/crazyflie-firmware (branch sitl-release); it is sitl_make/build/cf2"
 )
-#: UDP port for the first vehicle's client, to which the instance number is added. Clients look for vehicles there.
-CLIENT_PORT = 19850
+CLIENT_PORT = UDP_PORT  #: for the first vehicle's client; the instance number is added
 MOST_INSTANCES: Final = 10
 SLOW_EVERY: Final = 20  #: number of steps between readings of the magnetometer, and of the barometer
 POSE_EVERY: Final = 10  #: number of steps between positions
@@ -69,10 +69,9 @@ RETRY_S: Final = 0.005
 ANSWER_S: Final = 1.0
 LONGEST_ANSWER_S: Final = 6.0
 _PAUSE_S: Final = 0.05  # time between requests
-MAX_PACKET: Final = 32  #: bytes
-HELLO: Final = b"\xf3"
-EMPTY: Final = b"\xff"
-SWITCH_OFF: Final = b"\xff\xfe\x02"  #: a packet for a vehicle's radio, which switches the rest of the vehicle off
+MAX_PACKET: Final = 1 + MAX_DATA  #: bytes
+EMPTY: Final = NULL_PACKET.encode()
+SWITCH_OFF: Final = POWER_OFF.encode()
 VERSION: Final = b"\xd1\x00"  #: request for the protocol's version, from port 13
 SIMULATOR: Final = 0x90  #: header of port 9, channel 0
 
