@@ -196,8 +196,8 @@ class SignalEvent(threading.Event):
 def interrupt_deferred() -> Iterator[threading.Event]:
     """Make Ctrl-C set an event during the block, and raise :class:`KeyboardInterrupt` only at the end of the block.
 
-    Used to end several flights, where an exception in between would skip the remaining flights. Does nothing outside
-    the main thread, or if the program handles Ctrl-C itself.
+    Used to end several flights: an exception after one of them would skip the rest. Does nothing outside the main
+    thread, or if the program handles Ctrl-C itself.
     """
     noted = SignalEvent()
     on_main = threading.current_thread() is threading.main_thread()

@@ -110,7 +110,7 @@ def read_within(pipe: IO[bytes], within_s: float) -> bytes | None:
     import ctypes
     import msvcrt
 
-    # Only sockets can be waited for with a time limit: ask how much a read would return, and whether the end is there.
+    # Windows waits with a time limit for sockets only: ask how much a read would return, and whether the end is there.
     # learn.microsoft.com/windows/win32/api/namedpipeapi/nf-namedpipeapi-peeknamedpipe, also for anonymous pipes
     handle, there = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor)), ctypes.c_ulong()
     peek = ctypes.WinDLL("kernel32").PeekNamedPipe
@@ -314,8 +314,8 @@ def is_open_to_others(mode: int) -> bool:
 def single_keys(terminal: int) -> Iterator[Callable[[float], bytes | None]]:
     """Let a terminal report single keys in the block, without Enter, and restore it afterwards. Main thread only.
 
-    Yields a function that waits for keys for at most so many seconds and returns their bytes as POSIX terminals send
-    them, None if there were none, or nothing if the terminal has been closed. Ctrl-C still interrupts; Ctrl-Z does not
+    Yields a function that waits for keys, up to a time limit [s], and returns their bytes as POSIX terminals send them,
+    None if there were none, or nothing if the terminal has been closed. Ctrl-C still interrupts; Ctrl-Z does not
     suspend a flight, and Ctrl-S has no effect.
     """
     if sys.platform == "win32":

@@ -36,7 +36,7 @@ _LONGEST_WAIT_NS: Final = 1_000_000_000  #: maximum time to wait in the selector
 _MOST_STALE: Final = 4  #: maximum number of queue entries per link; beyond it, stale entries are removed
 CHECK_S: Final = 0.05  #: interval between checks
 STALL_CHECKS: Final = 5  #: 0.25 s: gives other vehicles a new thread before their pilots' silence makes them hover
-HANG_CHECKS: Final = 40  #: 2 s: the vehicle is given up
+HANG_CHECKS: Final = 40  #: 2 s: the host gives up the vehicle
 
 
 class Ticker:
@@ -411,7 +411,7 @@ class LinkThread:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
-                return  # another thread took over the link in the meantime
+                return  # another thread has taken over the link
             if link in self._paused:
                 self._paused.remove(link)
                 readable = True  # it may be readable, because it was not polled

@@ -84,8 +84,8 @@ class Shutdown:
     def request(self, reason: str, *, hurry: bool, once: bool = False) -> None:
         """Request that the process end. Thread-safe, even for signal handlers.
 
-        A second request ends the process immediately. ``once``: whether this one counts neither as the first nor as the
-        second, because nobody who sees the process made it.
+        A second request ends the process immediately. ``once``: whether the system makes it, as when a terminal
+        is closed; it then counts neither as the first nor as the second.
         """
         if hurry or (self._asked and not once):
             self.hurry.set()
@@ -111,7 +111,7 @@ def serve(
     ``make_end`` creates the transport server, given the name and the vehicle's address; by default, for this host only.
 
     Writes a line starting with ``ready`` to standard output once applications can connect and the vehicle answers.
-    Until then it writes ``serving`` and, after each change, what it is waiting for, the last failure and a remedy (not
+    Until then it writes ``serving`` and, after each change, its reason for waiting, the last failure and a remedy (not
     with ``parent_fd``). Ends on SIGINT, SIGTERM or SIGHUP, after landing a flying vehicle within at most
     ``land_within_s`` [s]. A second signal other than SIGHUP ends the wait. With ``parent_fd``, the reading end of a
     pipe, it lands and ends at end of file, which occurs when the parent dies. It leaves SIGINT to the parent, because a

@@ -1,6 +1,6 @@
 """A WebSocket server for Foxglove: live topics with the same schemas as recordings, and the drones' parameters.
 
-The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends on its own threads, and
+The ``foxglove-sdk`` implements the protocol (https://github.com/foxglove/ws-protocol), sends from its own threads, and
 drops the oldest messages if a viewer does not read. Any viewer can read parameters; writing one acquires a lease for a
 short time.
 """

@@ -143,7 +143,7 @@ if sys.platform == "win32":
     def _create(name: str, size: int) -> mmap.mmap:
         import _winapi
 
-        # If somebody uses the name, CreateFileMapping and ``mmap`` return that memory, of its size and with its content
+        # If the name is in use, CreateFileMapping and ``mmap`` return that memory, of its size and with its content
         # (learn.microsoft.com/windows/win32/api/winbase/nf-winbase-createfilemappinga). The handle keeps it for ours.
         none, most = (_winapi.INVALID_HANDLE_VALUE, _winapi.NULL), (size >> 32, size & 0xFFFFFFFF)
         handle = _winapi.CreateFileMapping(*none, _winapi.PAGE_READWRITE, *most, name)

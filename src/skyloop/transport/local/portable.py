@@ -224,7 +224,7 @@ class StreamSocket:
                 self._inside = True
                 try:
                     self._send_rest()
-                    # From here on, a packet that is sent in part has a thread of its own.
+                    # From here on, a partly sent packet gets its own thread.
                     self._awaiting_room = False
                     return True
                 except BlockingIOError:

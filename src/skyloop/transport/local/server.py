@@ -375,7 +375,7 @@ class LocalServer(TransportServer):
             lock.acquire(is_command(packet))
             try:
                 more = connection.pilot and poll(0)
-                if more:  # the packet had to wait, so packets that have arrived in the meantime may supersede it
+                if more:  # the packet had to wait, so later ones may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)

@@ -270,11 +270,11 @@ class CrazyflieSetpoints:
         flying = bool(self._flies(now_ns))
         if self._decision is not Decision.STAY and not flying:
             return  # a take-off ends in a hover; one that a landing withdrew could still happen
-        anew = self._decision is not Decision.STAY or not self._steering
+        begins = self._decision is not Decision.STAY or not self._steering
         self._steering, self.left_alone = True, False
         self._decide(Decision.STAY, now_ns)
-        if setpoint is None and flying and (anew or self._setpoint is not None):
-            self._hold(now_ns, anew=anew)
+        if setpoint is None and flying and (begins or self._setpoint is not None):
+            self._hold(now_ns, here=begins)
         if type(setpoint) is not type(self._setpoint):
             self._planned = self._height_m = self._place = self._heading_rad = None
             if self._setpoint is not None:
@@ -306,10 +306,10 @@ class CrazyflieSetpoints:
         self._lands_until_ns = now_ns + nanoseconds(duration_s + LATE_S)
         self._flight = _Flight(HighLevelLand(0, self._ground_m, 0.0, True, duration_s))
 
-    def _hold(self, now_ns: int, *, anew: bool = False) -> None:
-        """Come to rest and hover: near the vehicle (``anew``), or at the end of its plan."""
+    def _hold(self, now_ns: int, *, here: bool = False) -> None:
+        """Come to rest and hover: near the vehicle (``here``), or at the end of its plan."""
         estimate = self.telemetry.estimate
-        if anew or self._relaxes == RELAXES or self._moving is None:
+        if here or self._relaxes == RELAXES or self._moving is None:
             if estimate.position_m is None or estimate.yaw_rad is None:
                 return
             x, y, z = (
@@ -547,7 +547,7 @@ class CrazyflieSetpoints:
             return []
         if self._relaxes == RELAXES:  # the high-level commander must take over first
             if self._flight is None:
-                self._hold(now_ns, anew=True)
+                self._hold(now_ns, here=True)
             return self._flown(now_ns)
         if velocity == Velocity():
             if self._moving != Velocity():

@@ -433,7 +433,7 @@ def answer_arm(request: CrtpPacket, *, success: bool, armed: bool) -> CrtpPacket
     return CrtpPacket(request.port, request.channel, bytes((command, success, armed)))
 
 
-# What the vehicle is -------------------------------------------------------------------------------------------------
+# Versions -----------------------------------------------------------------------------------------------------------
 
 
 class VersionQuery(IntEnum):
